@@ -12,6 +12,7 @@ from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 from tensordict import TensorDict
@@ -20,6 +21,7 @@ from proposer_rl.curricula import (
     Curriculum,
     Filtered,
     FirstOrderProposer,
+    Mixed,
     Modelled,
     PairedProposer,
     ProposerCurriculum,
@@ -44,7 +46,14 @@ from proposer_rl.meta.assembly import (
 from proposer_rl.meta.replicas import ReplicasInWorkers, worker_env
 from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.models import ActorCritic
-from proposer_rl.recipes import file_content
+from proposer_rl.recipes import (
+    REFERENCE,
+    Recipe,
+    available,
+    file_content,
+    filter_content,
+    merged,
+)
 from proposer_rl.runs.checkpoint import CheckpointError, State, learnt_curriculum
 from proposer_rl.settings import ArgumentError, Count, NotNegative, Positive, arguments, checked
 from proposer_rl.streams import Streams
@@ -170,6 +179,83 @@ def modelled(curriculum: Curriculum, settings: Mapping[str, Any], run: Component
     """
     run.task.features(run.task.space.sample(1, Streams(0).generator())[None])
     return make(Modelled, settings, run, curriculum=curriculum)
+
+
+def recipe_settings(recipe: Recipe) -> dict[str, Any]:
+    """Returns the settings of a recipe by key, such as ``curriculum``, over those of its file."""
+    if recipe.target:
+        return {"curriculum": {**recipe.settings, "_target_": recipe.target}}
+    file = file_content(f"method/{recipe.name}")
+    # What a file makes of a class of its own is the default of the function, too.
+    there = {
+        name: value
+        for name, value in file["curriculum"].items()
+        if not (isinstance(value, Mapping) and "_target_" in value)
+    }
+    return merged({**file, "curriculum": there}, recipe.by_key())
+
+
+def around(curriculum: Curriculum, settings: Mapping[str, Any], run: Components) -> Curriculum:
+    """Returns a curriculum with the filter and the model around it that settings by key have."""
+    if settings.get("filter") is not None:
+        curriculum = filtered(curriculum, settings["filter"], run)
+    if settings.get("model") is not None:
+        curriculum = modelled(curriculum, settings["model"], run)
+    return curriculum
+
+
+def mixture(components: Components, parts: dict[str, dict[str, Any]]) -> Mixed:
+    """Makes batches of which each of some methods has its share.
+
+    Args:
+        components: of the run.
+        parts: by the names of methods, the settings that differ from their files'; besides
+            ``share``, of the levels of a batch (1; with 0 the method is left out), and ``filter``,
+            as :func:`~proposer_rl.recipes.filter_content` takes it.
+
+    Raises:
+        ArgumentError: for an unknown method, a setting that it does not have, one that its file
+            takes from elsewhere and that is not given, or shares that are all zero.
+    """
+    for name in parts:
+        if name not in available("method"):
+            raise ArgumentError(
+                f"parts.{name}: unknown; there are: {', '.join(available('method'))}"
+            )
+    made: list[tuple[Curriculum, float]] = []
+    for name, given in parts.items():
+        try:
+            made += _part(components, name, **given)
+        except ArgumentError as error:
+            raise ArgumentError(f"parts.{name}.{error}") from error
+    if not made:
+        raise ArgumentError(f"parts={list(parts)}: must have one whose share is above 0")
+    curricula, shares = zip(*made, strict=True)
+    return Mixed(list(curricula), list(shares))
+
+
+@checked
+def _part(
+    components: Components,
+    name: str,
+    /,
+    *,
+    share: NotNegative = 1.0,
+    filter: str | dict[str, Any] | None = None,
+    **given: Any,
+) -> list[tuple[Curriculum, float]]:
+    """Returns a part of a mixture and its share, or nothing if that is 0."""
+    if not share:
+        return []
+    settings = recipe_settings(Recipe("method", name, given))
+    if filter is not None:
+        settings = merged(settings, filter_content(filter))
+    own = settings["curriculum"]
+    for key, value in own.items():
+        if isinstance(value, str) and (reference := REFERENCE.fullmatch(value)):
+            raise ArgumentError(f"{key}: missing; alone the method has that of {reference[1]}")
+    curriculum: Curriculum = make(resolve_name(own.pop("_target_")), own, components)
+    return [(around(curriculum, settings, components), share)]
 
 
 def target(target: Distribution) -> SamplingCurriculum:

@@ -244,7 +244,7 @@ def merged(*settings: Mapping[str, Any]) -> dict[str, Any]:
     for some in settings:
         for key, value in some.items():
             own = isinstance(value, Mapping)
-            found[key] = {**(found.get(key) or {}), **value} if own else value
+            found[key] = merged(found.get(key) or {}, value) if own else value
     return found
 
 

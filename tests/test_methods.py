@@ -7,10 +7,12 @@ from typing import Any
 
 import pytest
 
-from proposer_rl.curricula import ReplayRule, Scorer
+import proposer_rl as prl
+from proposer_rl.curricula import ReplayRule, SamplingCurriculum, Scorer, Student
 from proposer_rl.meta.assembly import ProposerSettings
-from proposer_rl.methods import Components, UnfitTaskError, filtered, make, target
+from proposer_rl.methods import Components, UnfitTaskError, filtered, make, mixture, target
 from proposer_rl.settings import ArgumentError, Count
+from proposer_rl.streams import Streams
 
 TASK = SimpleNamespace(space="the space", target="the target", edit=abs)
 RUN = Components(TASK, ProposerSettings(), [3])  # type: ignore[arg-type]
@@ -84,3 +86,57 @@ def test_what_a_task_lacks_is_named_and_other_errors_are_as_they_are() -> None:
         make(lambda space: (0).x, {}, RUN)  # type: ignore[attr-defined]
     with pytest.raises(ArgumentError, match=r"^times=1: "):
         filtered(None, {"times": 1}, RUN)  # type: ignore[arg-type]
+
+
+RANGES = prl.Parameters({"x": (0.0, 1.0)}, target={"x": 1.0})
+OFF = ("domain_randomization", "target", "currot")  # the mixture's own
+ON_RANGES = Components(RANGES, ProposerSettings(), [3])  # type: ignore[arg-type]
+
+
+def test_a_mixture_is_what_its_methods_propose_by_themselves() -> None:
+    parts: dict[str, dict[str, Any]] = {
+        "target": {},
+        "domain_randomization": {"share": 2},
+        "alp_gmm": {"share": 0},
+        "learning_progress": {"source": "episodes", "exploration": 1.0},
+    }
+    made = mixture(ON_RANGES, parts)
+    assert made.needs == () and made.reads == ("success",)
+    drawn = made.propose(Student(), 40, [Streams(0)]).levels["x"][0]
+    assert (drawn[:10] == 1).all()
+    alone = SamplingCurriculum(RANGES).propose(Student(), 20, [Streams(0, "part", 1)])
+    assert (drawn[10:30] == alone.levels["x"][0]).all()
+    assert (drawn[30:] * 8).long().bincount(minlength=8).tolist().count(1) == 6  # 10 in 8 bins
+
+
+def test_the_mixture_of_thirds_asks_one_model_of_success_and_nobody_else() -> None:
+    teacher = prl.Teacher(prl.curricula.mixture(parts={"currot": {"every": 2}}), RANGES)
+    assert teacher.curriculum.needs == () and teacher.reads == ("success",)
+    for _ in range(6):
+        drawn = teacher.propose(60)["x"]
+        assert (drawn[20:40] == 1).all()
+        teacher.observe({"return": drawn, "success": 1 - drawn})
+    uniform, transport = drawn[:20], drawn[40:]
+    assert float((uniform - 0.5).abs().mean()) < 0.2  # the most learnable; of all it is 0.25
+    assert 0.5 < float(transport.mean()) < 0.85  # where success is at least delta, 0.2
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"plrr": {}}, r"^parts.plrr: unknown; there are: accel, "),
+        ({"plr": {}}, r"^parts.plr.capacity: missing; alone the method has that of pool.capacity$"),
+        ({"target": {"share": -1}}, "^parts.target.share=-1: input should be"),
+        ({"target": {"share": 0}}, r"^parts=.*'target'.*: must have one whose share is above 0$"),
+        ({"target": {"name": 0}}, "^parts.target.name: unknown; there are none$"),
+        ({"alp_gmm": {"refit": 0}}, "^parts.alp_gmm.refit=0: input should be"),
+        ({"target": {"filter": "no"}}, "^parts.target.filter='no': must be one of"),
+        ({"target": 1}, "^parts.target=1: input should be an object"),
+    ],
+)
+def test_a_part_that_is_not_allowed_is_named(parts: Any, message: str) -> None:
+    with pytest.raises(ArgumentError, match=message) as refused:
+        prl.Teacher(
+            prl.curricula.mixture(parts={**{name: {"share": 0} for name in OFF}, **parts}), RANGES
+        )
+    assert "\n" not in str(refused.value)

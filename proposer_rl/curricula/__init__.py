@@ -14,6 +14,7 @@ from typing import Any
 from proposer_rl.curricula.batches import SomeBins as SomeBins
 from proposer_rl.curricula.batches import level_keys as level_keys
 from proposer_rl.curricula.bins import BinCurriculum as BinCurriculum
+from proposer_rl.curricula.bounds import BoundsCurriculum as BoundsCurriculum
 from proposer_rl.curricula.buffer import ReplayRule as ReplayRule
 from proposer_rl.curricula.buffer import draw_slots as draw_slots
 from proposer_rl.curricula.buffer import empty_buffer as empty_buffer
@@ -49,6 +50,7 @@ from proposer_rl.curricula.replay import ReplayCurriculum as ReplayCurriculum
 from proposer_rl.curricula.sampling import SamplingCurriculum as SamplingCurriculum
 from proposer_rl.curricula.sampling import SelectionCurriculum as SelectionCurriculum
 from proposer_rl.curricula.scores import Scorer as Scorer
+from proposer_rl.curricula.self_paced import SelfPacedCurriculum as SelfPacedCurriculum
 from proposer_rl.curricula.student import Student as Student
 from proposer_rl.curricula.student import TaskStudent as TaskStudent
 from proposer_rl.curricula.student import UnfitStudentError as UnfitStudentError

@@ -73,7 +73,7 @@ class AdaptiveMixture(Curriculum):
         times: candidates for each level of the way.
     """
 
-    remembers = ("_inbox", "_sums", "_best", "_lowest", "_highest", "_told")
+    remembers = ("_inbox", "_sums", "_best", "_lowest", "_highest", "_told", "_common")
 
     @checked
     def __init__(
@@ -94,7 +94,10 @@ class AdaptiveMixture(Curriculum):
         remember: float = 20.0,
         skilled: float = 0.4,
         shares: list[float] | None = None,
+        grades: bool = True,
+        least: float = 0.2,
     ) -> None:
+        self._grades, self._least = grades, least
         self._space, self._target = space, target
         self._known = inputs or partial(level_inputs, space)
         self._delta, self._half_life, self._times = delta, half_life, times
@@ -103,10 +106,11 @@ class AdaptiveMixture(Curriculum):
         self._given = shares
         self._inbox = Inbox()
         self._belief: Belief | None = None
-        self._sums = torch.zeros(0, len(ARMS), 5, dtype=torch.float64)
+        self._sums = torch.zeros(0, len(ARMS), 7, dtype=torch.float64)
         self._best = torch.zeros(0, dtype=torch.float64)  # label of the target
         self._lowest = torch.full((0,), torch.inf, dtype=torch.float64)  # return
         self._highest = -self._lowest
+        self._common = torch.zeros(2, 0, dtype=torch.float64)
         self._told = False  # whether success is told
         self._last: dict[str, Levels] = {}  # on the way, of each student [m]
         self._seen: list[tuple[Tensor, Tensor]] = []  # what was predicted, and its label [K, m]
@@ -178,6 +182,7 @@ class AdaptiveMixture(Curriculum):
         self._best = self._best.new_zeros(students)
         self._lowest = self._lowest.new_full((students,), torch.inf)
         self._highest = -self._lowest
+        self._common = self._common.new_zeros(2, students)
 
     def _take_in(self) -> None:
         """Learns from the outcomes since the last proposal."""
@@ -188,7 +193,8 @@ class AdaptiveMixture(Curriculum):
             self._belief.observe(seen["inputs"], labels, seen.get("items", None))
             self._seen.append((seen["predicted"], labels))
             error, returns = (seen["predicted"] - labels).square(), seen["return"]
-            rows = [torch.ones_like(labels), labels, error, returns, returns.square()]
+            won = seen["success"] if self._told else labels
+            rows = [torch.ones_like(labels), won, error, returns, returns.square(), labels, labels.square()]
             of = F.one_hot(seen["arm"], len(ARMS)).double().mT
             faded = 0.5 ** (1 / self._memory) * self._sums
             self._sums = faded + of @ torch.stack(rows, -1)
@@ -203,14 +209,20 @@ class AdaptiveMixture(Curriculum):
         self._highest = torch.maximum(self._highest, returns.amax(1))
         self._told = "success" in seen.keys()
         if self._told:
-            return seen["success"]
+            self._common = 0.5 ** (1 / 6) * self._common + torch.stack([seen["success"].sum(1), torch.full_like(self._best, seen["success"].shape[1])])
+            if self._grades and bool((self._common[0] >= 0.02 * self._common[1]).all()):
+                return seen["success"]
         low, high = self._lowest.unsqueeze(1), self._highest.unsqueeze(1)
         wide = (high - low) > EQUAL * torch.maximum(high.abs(), low.abs())
-        return torch.where(wide, (returns - low) / (high - low), 0.5)
+        grade = torch.where(wide, (returns - low) / (high - low), 0.5)
+        if not self._told:
+            return grade
+        rare = (self._common[0] < 0.02 * self._common[1]).unsqueeze(1) & bool(self._grades)
+        return torch.where(rare, torch.maximum(seen["success"], grade / 2), seen["success"])
 
     def _shares(self) -> Tensor:
         """Returns the shares of the arms in the next batch, float64 [K, 3]."""
-        number, label, error, returns, squares = self._sums.unbind(-1)
+        number, _, error, returns, squares, label, label2 = self._sums.unbind(-1)
 
         def variance(number: Tensor, mean: Tensor, square: Tensor) -> Tensor:
             return (square / number - (mean / number).square()).clamp(min=0)
@@ -218,15 +230,14 @@ class AdaptiveMixture(Curriculum):
         every = variance(number.sum(1), returns.sum(1), squares.sum(1))
         own = variance(number, returns, squares)[:, TARGET]
         signal = (own / every).sqrt().nan_to_num(1.0, posinf=1.0).clamp(max=1)
-        rate = (label / number)[:, UNIFORM].nan_to_num(0.0)
-        constant = number[:, UNIFORM] * rate * (1 - rate)
+        constant = (number * variance(number, label, label2))[:, UNIFORM].nan_to_num(0.0)
         skill = 1 - (error[:, UNIFORM] + 1) / (constant + 1)
         low = self._floor + (self._low - self._floor) * (2 * signal).clamp(max=1)
         half = self._half if self._told else 0.5
         target = low + (self._high - low) * self._best / (self._best + half)
         if self._target is None:
             target = torch.zeros_like(target)
-        way = (self._skilled + 0.5 * skill).clamp(0.2, 0.8)
+        way = (self._skilled + 0.5 * skill).clamp(self._least, 0.8)
         shares = torch.stack([target, (1 - target) * (1 - way), (1 - target) * way], -1)
         if self._given is not None:
             shares = torch.tensor([self._given] * len(shares), dtype=torch.float64)
@@ -259,7 +270,7 @@ class AdaptiveMixture(Curriculum):
         goals, x, items = self._inputs(targets), self._inputs(levels), self._items(levels)
         only = slice(k, k + 1)
         p = self._belief.predict(x[None], None if items is None else items[None], only)[0]
-        allowed = p >= p.max().clamp(max=self._delta)
+        allowed = p >= p.topk(count).values[-1].clamp(max=self._delta)
         extra = torch.where(allowed, -self._learn * 4 * p * (1 - p), FORBIDDEN)
         chosen = []
         for start in range(0, count, AT_ONCE):

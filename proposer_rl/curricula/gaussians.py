@@ -14,14 +14,14 @@ from torch import Tensor
 
 from proposer_rl.curricula.bins import along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.points import Points, nearest
 from proposer_rl.curricula.student import Student
 from proposer_rl.extras import install_command
 from proposer_rl.settings import ArgumentError, Share, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import Space, refuse_single_bin
+from proposer_rl.task import Space
 
 LEAST_STORED = 6  # earlier episodes, below which progress is 0
-CHUNK = 2**16  # earlier episodes that are compared at once
 TwoOrMore = Annotated[int, Interval(ge=2, le=1_000_000)]
 
 
@@ -75,17 +75,7 @@ class MixtureCurriculum(Curriculum):
         exploration: Share = 0.2,
         rounded: bool = True,
     ) -> None:
-        if not rounded and not hasattr(space, "at"):
-            raise ArgumentError(
-                f"rounded=false: {type(space).__name__} has bins alone; leave rounded=true"
-            )
-        if rounded and space.axes and space.size < 2:
-            raise ArgumentError(
-                "rounded=true: the space has a single bin, to which all points would be rounded; "
-                "give its axes bins, or rounded=false"
-            )
-        if not space.axes:
-            refuse_single_bin(space)
+        self._points = Points(space, rounded)
         if find_spec("sklearn") is None:
             raise ValueError(
                 f"alp_gmm: scikit-learn is missing; install it with: {install_command('alp-gmm')}"
@@ -98,7 +88,7 @@ class MixtureCurriculum(Curriculum):
         self.space = space
         self.needs = ("performance",) if source == "exact" else ()
         self._source, self._components, self._refit = source, components, refit
-        self._warmup, self._exploration, self._rounded = warmup, exploration, rounded
+        self._warmup, self._exploration = warmup, exploration
         # Points and tasks [K, H, D], returns and progress [K, H], float64 on the CPU.
         self._history: dict[str, Tensor] = {}
         self._mixtures: list[tuple[Tensor, Tensor]] = []  # of each student: see fit_mixture
@@ -113,10 +103,7 @@ class MixtureCurriculum(Curriculum):
         self._fit(streams)
         drawn = [self._draw(k, count, s.generator("choices")) for k, s in enumerate(streams)]
         points = torch.stack(drawn)
-        bins = nearest(points.flatten(0, 1), self.space.coordinates.double()).view(points.shape[:2])
-        draws = [s.generator("levels") for s in streams]
-        space: Any = self.space  # only one of continuous parameters has a method `at`
-        levels = space.generate(bins, draws) if self._rounded else space.at(points, draws)
+        levels, bins = self._points.levels(points, streams)
         notes = {"bins": bins, "points": points}
         if self._source == "exact":
             reached = student.performance(levels, streams[0].generator("performance"))["return"]
@@ -151,7 +138,7 @@ class MixtureCurriculum(Curriculum):
         """Adds tasks, returns and progress to the histories."""
         for evidence in self._inbox.take():
             points, returns = evidence["points"], evidence["returns"]
-            tasks = self.space.coordinates.double()[evidence["bins"]] if self._rounded else points
+            tasks = self._points.tasks(points, evidence["bins"])
             progress = torch.zeros_like(returns)
             if history := self._history:
                 past = zip(history["tasks"], history["returns"], tasks, returns, strict=True)
@@ -178,8 +165,9 @@ class MixtureCurriculum(Curriculum):
 
     def _draw(self, student: int, count: int, generator: torch.Generator) -> Tensor:
         """Draws a batch of points for one student, float64 [n, D]."""
-        size = self.space.coordinates.shape[1]
-        uniform = 2 * torch.rand(count, size, generator=generator, dtype=torch.float64) - 1
+        uniform = (
+            2 * torch.rand(count, self._points.size, generator=generator, dtype=torch.float64) - 1
+        )
         if not self._mixtures:
             return uniform
         explored = torch.rand(count, generator=generator) < self._exploration
@@ -247,32 +235,6 @@ def draw_points(
     middles, spread = means[:, :-1], covariances[:, :-1, :-1]
     noise = torch.randn(count, middles.shape[1], 1, generator=generator, dtype=means.dtype)
     return middles[which] + (torch.linalg.cholesky(spread)[which] @ noise).squeeze(-1)
-
-
-def nearest(points: Tensor, places: Tensor) -> Tensor:
-    """Finds the place nearest to each point, the last of equally near ones.
-
-    Args:
-        points: float [n, D].
-        places: float [m, D], m at least 1.
-
-    Returns:
-        int64 [n].
-
-    Example:
-        >>> nearest(torch.tensor([[0.9], [0.5]]), torch.tensor([[0.0], [1.0], [1.0]]))
-        tensor([2, 2])
-    """
-    best = torch.full((len(points),), torch.inf, dtype=points.dtype)
-    which = torch.zeros(len(points), dtype=torch.int64)
-    for start in range(0, len(places), CHUNK):
-        some = places[start : start + CHUNK].flip(0)  # min takes the first, flipped the last
-        # Through a matrix product, equal distances would not come out equal.
-        apart = torch.cdist(points, some, compute_mode="donot_use_mm_for_euclid_dist")
-        least, index = apart.min(1)
-        which = torch.where(least <= best, start + len(some) - 1 - index, which)
-        best = torch.minimum(best, least)
-    return which
 
 
 def absolute_progress(

@@ -60,6 +60,14 @@ class Bins:
         values = torch.arange(int(self.low[0]), int(self.high[-1]) + 1) if self.wide else self.low
         return values[(share * len(values)).long().clamp(max=len(values) - 1)]
 
+    def share(self, values: Tensor) -> Tensor:
+        """Returns a share of the range at which :meth:`at` gives each value, float64 [*B]: [*B]."""
+        if self.wide and self.low.is_floating_point():
+            return (values.double() - self.low[0]) / (self.high[-1] - self.low[0])
+        if self.wide:
+            return (values - self.low[0] + 0.5) / (self.high[-1] - self.low[0] + 1)
+        return (torch.searchsorted(self.low, values) + 0.5) / len(self.low)
+
     def moved(self, old: Tensor, noise: Tensor) -> Tensor:
         """Moves values [n] by a tenth of the range times noise, float64 [n]: [n], within it.
 
@@ -312,6 +320,11 @@ class ParameterSpace:
             level[name] = part.between(a[name].cpu(), b[name].cpu(), share, off)
         seeds = self._drawn_seeds(a.batch_size, generator)
         return TensorDict({**level, **seeds}, a.batch_size, device=self._device)
+
+    def place(self, levels: TensorDictBase) -> Tensor:
+        """Returns points of the box at which :meth:`at` gives levels [*B]: float64 [*B, D]."""
+        shares = [part.share(levels[name].cpu()) for name, part in self.bins.items()]
+        return 2 * torch.stack(shares, -1).double() - 1
 
     def edit(
         self, levels: TensorDictBase, count: int, generators: Sequence[torch.Generator]

@@ -9,10 +9,9 @@ from typing import Any
 
 from proposer_rl.curricula import Curriculum, LearnedCurriculum
 from proposer_rl.meta.assembly import ProposerSettings
-from proposer_rl.methods import Components, UnfitTaskError, filtered, make, modelled
+from proposer_rl.methods import Components, UnfitTaskError, around, make, recipe_settings
 from proposer_rl.recipes import (
     Recipe,
-    file_content,
     filter_content,
     merged,
     recipe_function,
@@ -38,8 +37,8 @@ def make_curriculum(
     if isinstance(curriculum, str):
         curriculum = recipe_function("method", curriculum)()
     if isinstance(curriculum, Recipe):
-        named, asked = curriculum.name, _settings(curriculum)
-        own = asked.pop("curriculum")
+        named, asked = curriculum.name, recipe_settings(curriculum)
+        own = resolved(asked.pop("curriculum"))
         try:
             made: Curriculum = make(resolve_name(own.pop("_target_")), own, run)
         except UnfitTaskError as error:
@@ -53,24 +52,9 @@ def make_curriculum(
         )
     if filter is not None:
         asked = merged(asked, filter_content(filter))
-    around = {key: asked[key] for key in ("filter", "model") if asked.get(key) is not None}
-    if "filter" in around:
-        made = filtered(made, around["filter"], run)
-    if "model" in around:
-        made = modelled(made, around["model"], run)
-    described = json.dumps(plain({"kind": named, **own, **around}), default=_name)
-    return made, json.loads(described)
-
-
-def _settings(recipe: Recipe) -> dict[str, Any]:
-    """The settings of a recipe by key, over those of its file."""
-    if recipe.target:
-        return {"curriculum": {**recipe.settings, "_target_": recipe.target}}
-    file = file_content(f"method/{recipe.name}")
-    # What a file makes of a class of its own is the default of the function, too.
-    named = file["curriculum"].items()
-    there = {name: value for name, value in named if not isinstance(value, Mapping)}
-    return merged({**file, "curriculum": resolved(there)}, recipe.by_key())
+    more = {key: asked[key] for key in ("filter", "model") if asked.get(key) is not None}
+    described = json.dumps(plain({"kind": named, **own, **more}), default=_name)
+    return around(made, more, run), json.loads(described)
 
 
 def _name(value: Any) -> str:

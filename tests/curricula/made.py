@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from proposer_rl.curricula import (
+    BoundsCurriculum,
     Curriculum,
     Filtered,
     FirstOrderCurriculum,
@@ -26,6 +27,7 @@ from proposer_rl.curricula import (
     Schedule,
     Scorer,
     SelectionCurriculum,
+    SelfPacedCurriculum,
     TaskStudent,
     TransportCurriculum,
 )
@@ -153,6 +155,10 @@ MADE: dict[str, Make] = {
     "alp_gmm, exact": lambda: MixtureCurriculum(
         SPACE, source="exact", warmup=8, refit=6, components=3
     ),
+    "adr": lambda: BoundsCurriculum(SPACE, boundary=0.9, episodes=3, lower=0.0, upper=0.1),
+    "spdl": lambda: SelfPacedCurriculum(
+        SPACE, TARGET, TASK.target_shares, delta=0.01, episodes=6, measure="return"
+    ),
     "currot": lambda: TransportCurriculum(SPACE, TASK.target_shares, delta=0.2, every=2, probes=2),
     "first order": lambda: FirstOrderCurriculum(SPACE, TARGET, target_levels=8, candidates=2),
     "first order, sampled": lambda: SampledFirstOrderCurriculum(SPACE, TASK.target_shares),
@@ -165,6 +171,16 @@ MADE: dict[str, Make] = {
     ),
     "transport on a model": lambda: modelled(
         filtered(TransportCurriculum(SPACE, TASK.target_shares, every=2, probes=2, exploration=0.1))
+    ),
+    "mixture on a model": lambda: modelled(
+        Mixed(
+            [
+                filtered(SamplingCurriculum(SPACE)),
+                SamplingCurriculum(TARGET),
+                filtered(TransportCurriculum(SPACE, TASK.target_shares, every=2, probes=2)),
+            ],
+            [1, 1, 1],
+        )
     ),
     "progress on a model": lambda: modelled(LearningProgressCurriculum(SPACE, probes=2)),
     "edits on a model": lambda: modelled(replay("learnability", "exact", edits=3)),

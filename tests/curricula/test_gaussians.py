@@ -13,14 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.mixture import GaussianMixture
 
-from proposer_rl.curricula import gaussians
+from proposer_rl.curricula import gaussians, points
 from proposer_rl.curricula.gaussians import (
     MixtureCurriculum,
     absolute_progress,
     draw_points,
     fit_mixture,
-    nearest,
 )
+from proposer_rl.curricula.points import nearest
 from proposer_rl.streams import Streams
 from tests.curricula.scripted import Scripted, reached, step
 
@@ -44,13 +44,13 @@ def test_the_nearest_is_that_of_a_loop_and_the_last_of_equals(
     coordinate = st.integers(-3, 3).map(float)
     point = st.tuples(coordinate, coordinate)
     places = data.draw(st.lists(point, min_size=1, max_size=12))
-    points = data.draw(st.lists(point, min_size=1, max_size=5))
+    drawn = data.draw(st.lists(point, min_size=1, max_size=5))
     expected = [
-        max((-math.dist(p, place), index) for index, place in enumerate(places))[1] for p in points
+        max((-math.dist(p, place), index) for index, place in enumerate(places))[1] for p in drawn
     ]
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(gaussians, "CHUNK", chunk)
-        assert nearest(torch.tensor(points), torch.tensor(places)).tolist() == expected
+        patched.setattr(points, "CHUNK", chunk)
+        assert nearest(torch.tensor(drawn), torch.tensor(places)).tolist() == expected
 
 
 def clusters(generator: torch.Generator) -> torch.Tensor:

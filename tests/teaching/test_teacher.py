@@ -132,7 +132,10 @@ FREE = {  # of what needs nothing of a learner, settings that are small
     "plr": SMALL,
     "alp_gmm": {"warmup": 16, "refit": 12, "components": 3},
     "learning_progress": {"source": "episodes"},
+    "adr": {"episodes": 2},
+    "spdl": {"episodes": 8},
     "model_transport": {"probes": 1},
+    "mixture": {"parts": {"currot": {"probes": 1}}},
 }
 SPACES: dict[str, Callable[[], Any]] = {
     "ranges": lambda: SPACE,
@@ -169,7 +172,7 @@ def test_whoever_needs_nothing_works_from_returns_and_success(name: str, space: 
     if space == "a task" and name == "hand_designed":
         settings = {"distributions": ["id", "id"], "until": [2]}
     recipe = getattr(prl.curricula, name)(**settings)
-    bins = {"alp_gmm", "learning_progress", "model_transport"}
+    bins = {"alp_gmm", "adr", "spdl", "learning_progress", "model_transport", "mixture"}
     if space == "a generator" and name in bins:
         with pytest.raises(ArgumentError, match="draws from bins"):
             prl.Teacher(recipe, SPACES[space]())

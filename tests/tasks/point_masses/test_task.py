@@ -57,7 +57,12 @@ def test_pictures_show_the_wall_and_the_way() -> None:
     "method",
     [pytest.param(["+method=accel"], marks=pytest.mark.slow), ["+method=model_transport"],
      ["+method=alp_gmm", "curriculum.rounded=false", "curriculum.warmup=4",
-     "curriculum.refit=4", "curriculum.components=2"]],
+     "curriculum.refit=4", "curriculum.components=2"],
+     pytest.param(["+method=adr", "curriculum.rounded=false", "curriculum.episodes=1"],
+     marks=pytest.mark.slow),
+     pytest.param(["+method=spdl", "curriculum.rounded=false", "curriculum.episodes=4",
+     "curriculum.measure=return"], marks=pytest.mark.slow),
+     pytest.param(["+method=mixture"], marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_runs_resume_with_the_same_bytes(method: list[str], train: Any) -> None:
     whole, parts = Path("whole"), Path("parts")

@@ -1,0 +1,108 @@
+"""Levels at points of a box, for curricula that draw from continuous distributions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
+
+import torch
+from annotated_types import Interval
+from torch import Tensor
+
+from proposer_rl.settings import ArgumentError
+from proposer_rl.streams import Streams
+from proposer_rl.task import Levels, Space, refuse_single_bin
+
+CHUNK = 2**16  # places that are compared at once
+Place = Annotated[float, Interval(ge=-1, le=1)]
+"""Where a parameter lies in its range, from -1 to 1."""
+
+
+class Points:
+    """The levels of a space at points of the box [-1, 1]^D that its coordinates span.
+
+    Args:
+        space: that has the bins.
+        rounded: whether points become levels of the nearest bins; else they are levels as they are,
+            which a space of continuous parameters has (its method ``at``).
+
+    Attributes:
+        size: the number D of coordinates.
+
+    Raises:
+        ValueError: if the space has a single bin, or no levels at points where these are asked for.
+    """
+
+    def __init__(self, space: Space, rounded: bool) -> None:
+        if not rounded and not hasattr(space, "at"):
+            raise ArgumentError(
+                f"rounded=false: {type(space).__name__} has bins alone; leave rounded=true"
+            )
+        if rounded and space.axes and space.size < 2:
+            raise ArgumentError(
+                "rounded=true: the space has a single bin, to which all points would be rounded; "
+                "give its axes bins, or rounded=false"
+            )
+        if not space.axes:
+            refuse_single_bin(space)
+        self._space, self._rounded = space, rounded
+        self.size: int = space.coordinates.shape[1]
+
+    @property
+    def free(self) -> Tensor:
+        """Returns the coordinates along which levels differ, int64 [F]."""
+        places = self._space.coordinates
+        differ = places.amax(0) > places.amin(0)
+        return (differ | (not self._rounded)).nonzero().flatten()
+
+    def levels(self, points: Tensor, streams: Sequence[Streams]) -> tuple[Levels, Tensor]:
+        """Returns the levels [K, n] at points float64 [K, n, D], and their bins, int64 [K, n]."""
+        places = self._space.coordinates.double()
+        bins = nearest(points.flatten(0, 1), places).view(points.shape[:2])
+        draws = [s.generator("levels") for s in streams]
+        space: Any = self._space  # only one of continuous parameters has a method `at`
+        return space.generate(bins, draws) if self._rounded else space.at(points, draws), bins
+
+    def tasks(self, points: Tensor, bins: Tensor) -> Tensor:
+        """Returns where the levels at points float64 [K, n, D] lie, float64 [K, n, D]."""
+        return self._space.coordinates.double()[bins] if self._rounded else points
+
+    def at(self, start: Mapping[str, float] | None) -> Tensor:
+        """Returns the point with some places by their axes' names, else 0: float64 [D].
+
+        Raises:
+            ArgumentError: for a name that is no axis's.
+        """
+        names = [*self._space.axes]
+        if len(names) != self.size:  # such as features of items
+            names = [str(i) for i in range(self.size)]
+        for name in start or {}:
+            if name not in names:
+                raise ArgumentError(f"start.{name}: unknown; there are: {', '.join(names)}")
+        return torch.tensor([(start or {}).get(name, 0.0) for name in names], dtype=torch.float64)
+
+
+def nearest(points: Tensor, places: Tensor) -> Tensor:
+    """Finds the place nearest to each point, the last of equally near ones.
+
+    Args:
+        points: float [n, D].
+        places: float [m, D], m at least 1.
+
+    Returns:
+        int64 [n].
+
+    Example:
+        >>> nearest(torch.tensor([[0.9], [0.5]]), torch.tensor([[0.0], [1.0], [1.0]]))
+        tensor([2, 2])
+    """
+    best = torch.full((len(points),), torch.inf, dtype=points.dtype)
+    which = torch.zeros(len(points), dtype=torch.int64)
+    for start in range(0, len(places), CHUNK):
+        some = places[start : start + CHUNK].flip(0)  # min takes the first, flipped the last
+        # Through a matrix product, equal distances would not come out equal.
+        apart = torch.cdist(points, some, compute_mode="donot_use_mm_for_euclid_dist")
+        least, index = apart.min(1)
+        which = torch.where(least <= best, start + len(some) - 1 - index, which)
+        best = torch.minimum(best, least)
+    return which

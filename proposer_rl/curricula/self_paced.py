@@ -1,0 +1,340 @@
+"""Self-paced learning: a Gaussian over the space that moves to the target as performance allows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import torch
+from annotated_types import Interval
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
+from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.points import Place, Points
+from proposer_rl.curricula.student import Student
+from proposer_rl.curricula.transport import shares_of_bins
+from proposer_rl.settings import ArgumentError, Count, Positive, checked
+from proposer_rl.streams import Streams
+from proposer_rl.task import Distribution, Space
+
+Floats = NDArray[np.float64]
+Goal = Callable[[Floats], tuple[float, Floats]]  # a value and its gradient
+Deviation = Annotated[float, Interval(gt=0, le=2)]
+
+WIDEST = 2.0  # standard deviation, with which a Gaussian is nearly uniform in the box
+SAMPLED = 1000  # levels of the target, whose mean and deviation are taken
+SLACK = 1e-4  # of the constraints, within which a solution is taken
+
+
+class SelfPacedCurriculum(Curriculum):
+    """Draws each student's levels from a Gaussian that moves towards the target's.
+
+    A level is a point of the box [-1, 1]^D that the space's coordinates span, drawn from a normal
+    distribution with independent coordinates, those within the box. After every ``episodes``
+    levels that came back, the mean and the deviations of the distribution p become those with the
+    least Kullback-Leibler divergence KL(p, target) among those with KL(p, present one) of at most
+    ``epsilon`` and an expected performance of at least ``delta`` (Klink et al. 2021, "A
+    Probabilistic Interpretation of Self-Paced Learning with Applications to Reinforcement
+    Learning", JMLR 22; Klink et al. 2020, arXiv 2004.11812, have the same with a penalty). The
+    target's Gaussian has its mean and deviations. See :func:`step_towards`.
+
+    Args:
+        space: that has the bins.
+        target: that is to be mastered.
+        target_shares: the target as shares of the bins, float [N].
+        delta: least expected performance.
+        epsilon: how far the distribution moves at a step.
+        episodes: between two steps, by which performance is told.
+        start: where the mean begins, from -1 for the first to 1 for the last value of an axis, by
+            the axis's name; 0, the middle, for others.
+        deviation: standard deviation at first.
+        least_deviation: that the distribution and the target have.
+        measure: of performance, ``"success"`` or ``"return"``.
+        rounded: see :class:`~proposer_rl.curricula.points.Points`.
+
+    Attributes:
+        means, deviations: of the distributions, float64 [K, D].
+
+    Raises:
+        ValueError: for an unknown axis, deviations that are not in order, or a space that has no
+            points.
+    """
+
+    remembers = ("means", "deviations", "_episodes", "_expected", "_counts", "_inbox")
+
+    @checked
+    def __init__(
+        self,
+        space: Space,
+        target: Distribution,
+        target_shares: Tensor,
+        *,
+        delta: float = 0.3,
+        epsilon: Positive = 0.05,
+        episodes: Count = 80,
+        start: dict[str, Place] | None = None,
+        deviation: Deviation = 0.5,
+        least_deviation: Deviation = 0.01,
+        measure: Measure = "success",
+        rounded: bool = True,
+    ) -> None:
+        if deviation < least_deviation:
+            raise ArgumentError(
+                f"deviation={deviation}: must be at least least_deviation={least_deviation}"
+            )
+        self.space, self._points = space, Points(space, rounded)
+        self.reads = ("success",) if measure == "success" else ()
+        self._limits = delta, epsilon, least_deviation
+        self._every, self._measure = episodes, measure
+        if rounded:
+            places = space.coordinates.double()
+            shares = shares_of_bins(target_shares, space).unsqueeze(-1)
+        else:
+            place: Any = space  # only one of continuous parameters knows the points of levels
+            places = place.place(target.sample(SAMPLED, Streams(0).generator("target")))
+            shares = torch.full((SAMPLED, 1), 1 / SAMPLED, dtype=torch.float64)
+        middle = (shares * places).sum(0)
+        spread = (shares * (places - middle).square()).sum(0).sqrt()
+        self._target = Gaussian(middle.numpy(), spread.clamp(min=least_deviation).numpy())
+        self._first = self._points.at(start), torch.full_like(middle, deviation)
+        self.means = self.deviations = torch.zeros(0, self._points.size, dtype=torch.float64)
+        # Since the last step: points [K, W, D], their log densities and performance [K, W].
+        self._episodes: list[dict[str, Tensor]] = []
+        self._expected: list[float] = []  # performance at the last step, of each student
+        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
+        self._inbox = Inbox()
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Draws points from the Gaussians, and returns levels [K, n] there."""
+        if not len(self.means):
+            self.means, self.deviations = (
+                each.expand(len(streams), -1).clone() for each in self._first
+            )
+        self._take_in()
+        shape = (count, self._points.size)
+        draws = [s.generator("choices") for s in streams]
+        shares = torch.stack([torch.rand(shape, generator=g, dtype=torch.float64) for g in draws])
+        means, deviations = self.means.unsqueeze(1), self.deviations.unsqueeze(1)
+        points, log_density = draw_in_box(means, deviations, shares)
+        levels, bins = self._points.levels(points, streams)
+        return self._inbox.batch(levels, bins=bins, points=points, log_density=log_density)
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Keeps what levels came to, for the next step.
+
+        Raises:
+            ValueError: if the outcome has no success and success is the measure.
+        """
+        self._inbox.check(batch, outcome)
+        if self._measure not in outcome.keys():
+            raise ValueError(f"measure={self._measure}: the outcome has no success")
+        self._counts += counts_of_bins(batch.notes["bins"], self.space)
+        reached = outcome[self._measure].double()
+        self._inbox.put(batch, **batch.notes.select("points", "log_density"), reached=reached)
+
+    def log(self) -> dict[str, Any]:
+        """Returns counts of levels by bin, the Gaussians, and how far they are from the target."""
+        self._take_in()
+        if not len(self.means):
+            return {}
+        counts, self._counts = self._counts, torch.zeros_like(self._counts)
+        return {
+            "histogram": along_axes(counts, self.space),
+            "means": self.means.tolist(),
+            "deviations": self.deviations.tolist(),
+            "target_divergence": [divergence(now, self._target)[0] for now in self._gaussians()],
+            **({"expected_performance": list(self._expected)} if self._expected else {}),
+        }
+
+    def _gaussians(self) -> list[Gaussian]:
+        each = zip(self.means.numpy(), self.deviations.numpy(), strict=True)
+        return [Gaussian(mean, deviation) for mean, deviation in each]
+
+    def _take_in(self) -> None:
+        """Adds episodes, and makes a step where there are enough."""
+        for evidence in self._inbox.take():
+            names = ("points", "log_density", "reached")
+            self._episodes.append({name: evidence[name] for name in names})
+            if sum(some["reached"].shape[1] for some in self._episodes) >= self._every:
+                self._step()
+
+    def _step(self) -> None:
+        """Moves the Gaussians by the episodes since the last step."""
+        points, log_density, reached = (
+            torch.cat([some[name] for some in self._episodes], 1).numpy()
+            for name in ("points", "log_density", "reached")
+        )
+        found = [
+            step_towards(self._target, now, *own, *self._limits)
+            for now, own in zip(
+                self._gaussians(), zip(points, log_density, reached, strict=True), strict=True
+            )
+        ]
+        self.means, self.deviations = (
+            torch.from_numpy(np.stack([getattr(new, name) for new, _ in found]))
+            for name in ("mean", "deviation")
+        )
+        self._expected = [expected for _, expected in found]
+        self._episodes = []
+
+
+class Gaussian(NamedTuple):
+    """A normal distribution with independent coordinates.
+
+    Attributes:
+        mean: float64 [D].
+        deviation: standard deviations, float64 [D].
+    """
+
+    mean: Floats
+    deviation: Floats
+
+
+def draw_in_box(means: Tensor, deviations: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns points of the box [-1, 1]^D drawn from Gaussians, and the logs of their densities.
+
+    Args:
+        means: within the box, float64 [K, 1, D].
+        deviations: float64 [K, 1, D].
+        shares: uniform from 0 to 1, float64 [K, n, D].
+
+    Returns:
+        Points, float64 [K, n, D], and densities but for one factor, float64 [K, n].
+    """
+    low, high = (torch.special.ndtr((end - means) / deviations) for end in (-1.0, 1.0))
+    z = torch.special.ndtri(low.lerp(high, shares))
+    points = (means + deviations * z).clamp(-1, 1)
+    z = (points - means) / deviations
+    log_density = -z.square() / 2 - deviations.log() - (high - low).log()
+    return points, log_density.sum(-1)
+
+
+def divergence(one: Gaussian, other: Gaussian) -> tuple[float, Floats]:
+    """Returns the Kullback-Leibler divergence KL(one, other) of Gaussians, and its gradient.
+
+    Returns:
+        The divergence; derivatives by the mean and by the logs of the deviations of one, [2 D].
+
+    Example:
+        >>> one, other = (Gaussian(np.array([mean]), np.ones(1)) for mean in (0.0, 1.0))
+        >>> divergence(one, other)[0]
+        0.5
+    """
+    ratio, away = one.deviation / other.deviation, (one.mean - other.mean) / other.deviation
+    value = (ratio**2 + away**2 - 1).sum() / 2 - np.log(ratio).sum()
+    return float(value), np.concatenate([away / other.deviation, ratio**2 - 1])
+
+
+def expected_performance(
+    one: Gaussian, points: Floats, log_density: Floats, reached: Floats
+) -> tuple[float, Floats]:
+    """Returns the mean of what was reached, if points were drawn from a Gaussian, and its gradient.
+
+    Each episode has the weight of its density in the Gaussian over that with which it was drawn;
+    weights are normalised.
+
+    Args:
+        one: the Gaussian.
+        points: of the episodes, [W, D].
+        log_density: with which they were drawn, but for one factor, [W].
+        reached: in them, [W].
+
+    Returns:
+        The expectation; derivatives by the mean and by the logs of the deviations, [2 D].
+    """
+    z = (points - one.mean) / one.deviation
+    log_weight = -(z**2).sum(-1) / 2 - np.log(one.deviation).sum() - log_density
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    value = float(weight @ reached)
+    slopes = np.concatenate([z / one.deviation, z**2 - 1], -1)  # of the log densities
+    return value, (weight * (reached - value)) @ slopes
+
+
+def step_towards(
+    target: Gaussian,
+    now: Gaussian,
+    points: Floats,
+    log_density: Floats,
+    reached: Floats,
+    delta: float,
+    epsilon: float,
+    least: float,
+) -> tuple[Gaussian, float]:
+    """Returns the Gaussian near the present one that is nearest to the target, and performs.
+
+    The minimum of KL(p, target) over Gaussians p with KL(p, now) <= epsilon and an expected
+    performance of at least delta, by sequential quadratic programming (SciPy's SLSQP). Where none
+    within epsilon has that, the one of the best expected performance that is found.
+
+    Args:
+        target: where to.
+        now: the present one.
+        points: of episodes, [W, D].
+        log_density: with which these were drawn, but for one factor, [W].
+        reached: in them, [W].
+        delta: least expected performance.
+        epsilon: largest divergence from the present one.
+        least: deviation of the new one.
+
+    Returns:
+        It; the performance that is expected of it.
+    """
+    # SciPy's solvers take long to import, and no other curriculum needs them.
+    from scipy.optimize import minimize
+
+    size = len(now.mean)
+    # In units of the present one, where divergence from it is alike in all directions.
+    units = np.concatenate([now.deviation, np.ones(size)])
+    unit = float(reached.std()) or 1.0  # of performance
+
+    def gaussian(x: Floats) -> Gaussian:
+        return Gaussian(now.mean + now.deviation * x[:size], now.deviation * np.exp(x[size:]))
+
+    def moved(x: Floats) -> tuple[float, Floats]:
+        value, slope = divergence(gaussian(x), now)
+        return epsilon - value, -slope * units
+
+    def left(x: Floats) -> tuple[float, Floats]:
+        """The log of the divergence, which goes over orders of magnitude."""
+        value, slope = divergence(gaussian(x), target)
+        return float(np.log(epsilon + value)), slope * units / (epsilon + value)
+
+    def lacks(x: Floats) -> tuple[float, Floats]:
+        value, slope = expected_performance(gaussian(x), points, log_density, reached)
+        return (delta - value) / unit, -slope * units / unit
+
+    def reaches(x: Floats) -> tuple[float, Floats]:
+        value, slope = lacks(x)
+        return -value, -slope
+
+    def least_of(goal: Goal, start: Floats, *held: Goal) -> Floats:
+        """Returns where a goal is least with others not negative, or the start."""
+        found = minimize(
+            goal,
+            start,
+            jac=True,
+            method="SLSQP",
+            bounds=list(zip(lowest, highest, strict=True)),
+            constraints=[
+                {"type": "ineq", "fun": lambda x, f=f: f(x)[0], "jac": lambda x, f=f: f(x)[1]}
+                for f in held
+            ],
+            options={"maxiter": 200, "ftol": 1e-9},
+        ).x.clip(lowest, highest)
+        kept = all(each(found)[0] >= -SLACK for each in held)
+        return found if kept and goal(found)[0] < goal(start)[0] else start
+
+    # Bounds of the mean, which stays in the box, and of the deviations.
+    lowest = np.concatenate([(-1 - now.mean) / now.deviation, np.log(least / now.deviation)])
+    highest = np.concatenate([(1 - now.mean) / now.deviation, np.log(WIDEST / now.deviation)])
+    x = np.zeros(2 * size)
+    if lacks(x)[0] > 0:
+        x = least_of(lacks, x, moved)
+    if lacks(x)[0] <= 0:
+        x = least_of(left, x, moved, reaches)
+    return gaussian(x), delta - lacks(x)[0] * unit

@@ -1,0 +1,145 @@
+"""ADR against a simulation in plain Python, one level after another."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+import proposer_rl as prl
+from proposer_rl.curricula import BoundsCurriculum, Student
+from proposer_rl.streams import Streams
+from tests.curricula.scripted import Scripted, reached, step
+
+SPACE = prl.Parameters({"a": (0.0, 10.0), "b": (-1.0, 1.0)}, bins=5)
+STEP, EPISODES = 0.3, 3
+
+
+def skill(a: float, b: float) -> float:
+    """Solved from a = 2 to 8 and below b = 0.5, half solved up to 0.8."""
+    return float(2 <= a <= 8) * (1.0 if b < 0.5 else 0.5 if b < 0.8 else 0.0)
+
+
+class Simulated:
+    """Algorithm 1 of the paper, of one student."""
+
+    def __init__(self, start: dict[str, float]) -> None:
+        self.start = start
+        self.bounds = {(axis, side): at for axis, at in start.items() for side in ("low", "high")}
+        self.buffers: dict[tuple[str, str], list[float]] = {key: [] for key in self.bounds}
+
+    def play(self, key: tuple[str, str], place: float, performance: float) -> None:
+        if place != self.bounds[key]:
+            return
+        self.buffers[key].append(performance)
+        if len(self.buffers[key]) < EPISODES:
+            return
+        mean, self.buffers[key] = sum(self.buffers[key]) / EPISODES, []
+        out = STEP if mean >= 0.7 else -STEP if mean <= 0.3 else 0.0
+        if key[1] == "high":
+            self.bounds[key] = min(max(place + out, self.start[key[0]]), 1.0)
+        else:
+            self.bounds[key] = max(min(place - out, self.start[key[0]]), -1.0)
+
+
+@pytest.mark.parametrize("count", [3, 16])
+def test_bounds_move_as_in_a_simulation(count: int) -> None:
+    """Batches come back late and in parts; of the third one some never do."""
+    start = {"a": 0.1, "b": -0.9}
+    curriculum = BoundsCurriculum(
+        SPACE, start=start, step=STEP, lower=0.3, upper=0.7, episodes=EPISODES, rounded=False
+    )
+    simulated, batches, seen = [Simulated(start) for _ in range(2)], [], set()
+    keys = [(axis, side) for axis in ("a", "b") for side in ("low", "high")]
+    for update in range(480 // count):
+        batch = curriculum.propose(Student(), count, [Streams(s, update) for s in (0, 1)])
+        found = curriculum.bounds.flatten(1).tolist()
+        assert found == [[own.bounds[key] for key in keys] for own in simulated]
+        seen |= {tuple(found[0])}
+        for k, own in enumerate(simulated):
+            for name, low, high in (("a", 0.0, 10.0), ("b", -1.0, 1.0)):
+                places = 2 * (batch.levels[name][k] - low) / (high - low) - 1
+                assert (places >= own.bounds[name, "low"] - 1e-12).all()
+                assert (places <= own.bounds[name, "high"] + 1e-12).all()
+        batches.append(batch)
+        if len(batches) < 3:
+            continue
+        late = batches.pop(0)
+        levels = zip(late.levels["a"].flatten(), late.levels["b"].flatten(), strict=True)
+        told = torch.tensor([skill(float(a), float(b)) for a, b in levels]).view(2, count)
+        came = slice(0, None) if update != 4 else slice(0, count // 2)
+        for part in (slice(1, None, 2), slice(0, None, 2)):
+            some = torch.arange(count)[came][part]
+            outcome = reached(told[:, some], told[:, some])
+            curriculum.observe(Student(), late[:, some], outcome)
+        for k, own in enumerate(simulated):
+            for place, which in enumerate(late.notes["bound"][k, came].tolist()):
+                if which >= 0:
+                    at = float(late.notes["at"][k, place])
+                    own.play(keys[which], at, float(told[k, place]))
+    assert len(seen) > 8
+    for own in simulated:  # within two steps of where the student fails
+        assert own.bounds["b", "low"] == -1.0 and -0.1 <= own.bounds["b", "high"] <= 1.0
+        assert -0.9 <= own.bounds["a", "low"] <= -0.1 and 0.3 <= own.bounds["a", "high"] <= 1.0
+
+
+def test_levels_lie_on_bounds_as_often_as_asked_and_else_uniformly_within() -> None:
+    curriculum = BoundsCurriculum(SPACE, boundary=0.4, rounded=False)
+    curriculum.propose(Student(), 1, [Streams(0)])
+    curriculum.bounds = torch.tensor([[[-0.5, 0.25], [0.0, 1.0]]]).double()
+    batch = curriculum.propose(Student(), 20_000, [Streams(1)])
+    places = torch.stack([batch.levels["a"][0] / 5 - 1, batch.levels["b"][0]], -1)
+    which = batch.notes["bound"][0]
+    shares = (which + 1).bincount(minlength=5) / 20_000
+    torch.testing.assert_close(shares, torch.tensor([0.6, *[0.1] * 4]), atol=0.012, rtol=0)
+    for bound, at in enumerate([-0.5, 0.25, 0.0, 1.0]):
+        rest = places[which == bound]
+        assert (rest[:, bound // 2] - at).abs().max() < 1e-12 and rest.std(0).min() == 0
+        assert rest.std(0).max() > 0.2 * (1 if bound < 2 else 0.75)
+    inside = places[which == -1]
+    for axis, (low, high) in enumerate([(-0.5, 0.25), (0.0, 1.0)]):
+        quarters = ((inside[:, axis] - low) / (high - low) * 4).long().bincount(minlength=4)
+        torch.testing.assert_close(
+            quarters / len(inside), torch.full((4,), 0.25), atol=0.02, rtol=0
+        )
+
+
+def test_on_bins_it_goes_from_the_start_to_where_the_student_fails() -> None:
+    skills = torch.ones(2, 9)
+    skills[1, 6:] = 0.0
+    task = Scripted(skills, batch_size=24)
+    curriculum = BoundsCurriculum(task.space, start={"place": -1.0}, step=0.25, episodes=4)
+    first = step(curriculum, task, 0)
+    assert (first == 0).all()
+    for update in range(1, 40):
+        last = step(curriculum, task, update)
+    told = curriculum.log()
+    assert last[0].max() == 8 and 5 <= int(last[1].max()) <= 6 and last.min() == 0
+    assert told["width"][0] == 2.0 and 1.25 <= told["width"][1] <= 1.5
+    assert sum(told["histogram"]) == 2 * 40 * 24
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"start": {"c": 0.0}}, "^start.c: unknown; there are: a, b$"),
+        ({"start": {"a": 2.0}}, "^start.a=2.0: input should be less than or equal to 1$"),
+        ({"lower": 0.6}, r"^lower=0.6: must be at most upper=0.5$"),
+        ({"step": 0.0}, "^step=0.0: input should be greater than 0$"),
+        ({"boundary": 0.0}, "^boundary=0.0: input should be greater than 0$"),
+        ({"episodes": 0}, "^episodes=0: input should be"),
+    ],
+)
+def test_what_is_out_of_bounds_is_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(prl.ArgumentError, match=message):
+        BoundsCurriculum(SPACE, **options)
+
+
+def test_an_outcome_without_success_is_refused_and_counts_nothing() -> None:
+    curriculum = BoundsCurriculum(SPACE)
+    batch = curriculum.propose(Student(), 4, [Streams(0)])
+    outcome = reached(torch.ones(1, 4))
+    with pytest.raises(ValueError, match="measure=success: the outcome has no success"):
+        curriculum.observe(Student(), batch, outcome.exclude("success"))
+    curriculum.observe(Student(), batch, outcome)

@@ -1,0 +1,176 @@
+"""Self-paced learning: its steps against a search on a grid, its draws, scripted students."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import kstest, truncnorm
+
+import proposer_rl as prl
+from proposer_rl.curricula import SelfPacedCurriculum, Student
+from proposer_rl.curricula.self_paced import (
+    Floats,
+    Gaussian,
+    divergence,
+    draw_in_box,
+    expected_performance,
+    step_towards,
+)
+from proposer_rl.streams import Streams
+from proposer_rl.tasks.parameters import ParameterSpace, intervals, points
+from tests.curricula.scripted import Scripted, reached, step
+
+NOW, TARGET = (Gaussian(np.array([m]), np.array([s])) for m, s in ((-0.2, 0.3), (0.8, 0.02)))
+EPSILON, LEAST = 0.1, 0.01
+
+
+def episodes(seed: int, middle: float) -> tuple[Floats, Floats, Floats]:
+    """Those of a student that succeeds below a place, drawn from the present Gaussian."""
+    noise = np.random.default_rng(seed)
+    places = truncnorm.rvs(-0.8 / 0.3, 1.2 / 0.3, -0.2, 0.3, size=(60, 1), random_state=noise)
+    density = truncnorm.logpdf(places[:, 0], -0.8 / 0.3, 1.2 / 0.3, -0.2, 0.3)
+    solved = noise.random(60) < 1 / (1 + np.exp((places[:, 0] - middle) / 0.1))
+    return places, density, solved.astype(float)
+
+
+def on_a_grid(seen: tuple[Floats, Floats, Floats], delta: float) -> tuple[float, float]:
+    """Divergence from the target and expected performance of the best of all Gaussians near NOW."""
+    means, deviations = np.meshgrid(np.linspace(-1, 1, 801), np.geomspace(LEAST, 2, 400))
+    places, density, solved = seen
+
+    def apart(other: Gaussian) -> Floats:
+        ratio, away = deviations / other.deviation, (means - other.mean) / other.deviation
+        found: Floats = (ratio**2 + away**2 - 1) / 2 - np.log(ratio)
+        return found
+
+    near = apart(NOW) <= EPSILON
+    means, deviations, left = means[near], deviations[near], apart(TARGET)[near]
+    z = (places - means) / deviations
+    weight = np.exp(-(z**2) / 2 - density[:, None])
+    performance = (weight * solved[:, None]).sum(0) / weight.sum(0)
+    enough = performance >= delta
+    if not enough.any():
+        return float(left[performance.argmax()]), float(performance.max())
+    best = np.where(enough, left, np.inf).argmin()
+    return float(left[best]), float(performance[best])
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("delta", [0.2, 0.6, 0.75, 0.99])
+@pytest.mark.parametrize("middle", [0.1, -0.2])
+def test_a_step_is_the_best_on_a_grid(seed: int, delta: float, middle: float) -> None:
+    seen = episodes(seed, middle)
+    left, performance = on_a_grid(seen, delta)
+    new, expected = step_towards(TARGET, NOW, *seen, delta, EPSILON, LEAST)
+    assert divergence(new, NOW)[0] <= EPSILON + 1e-3
+    assert expected == pytest.approx(expected_performance(new, *seen)[0])
+    if performance >= delta:
+        assert expected >= delta - 1e-3
+        assert divergence(new, TARGET)[0] <= 1.01 * left
+    else:
+        assert expected >= performance - 2e-3
+
+
+def test_gradients_are_those_of_differences() -> None:
+    noise = np.random.default_rng(0)
+    at, other = noise.normal(size=6), Gaussian(noise.normal(size=3), noise.uniform(0.5, 1, 3))
+    seen = noise.normal(size=(9, 3)), noise.normal(size=9), noise.normal(size=9)
+
+    def gaussian(x: Floats) -> Gaussian:
+        return Gaussian(x[:3], np.exp(x[3:]))
+
+    for value in (
+        lambda x: divergence(gaussian(x), other),
+        lambda x: expected_performance(gaussian(x), *seen),
+    ):
+        steps = 1e-6 * np.eye(6)
+        slopes = [(value(at + s)[0] - value(at - s)[0]) / 2e-6 for s in steps]
+        np.testing.assert_allclose(value(at)[1], slopes, rtol=1e-5, atol=1e-7)
+
+
+def test_draws_are_those_of_a_gaussian_within_the_box() -> None:
+    means, deviations = (
+        torch.tensor(x).double().view(2, 1, 2) for x in ([0.9, 0.0, -1.0, 0.3], [0.5, 2, 0.1, 0.01])
+    )
+    shares = torch.rand(2, 2000, 2, generator=torch.Generator().manual_seed(0)).double()
+    places, density = draw_in_box(means, deviations, shares)
+    expected = np.zeros((2, 2000))
+    for k in range(2):
+        for axis in range(2):
+            mean, deviation = float(means[k, 0, axis]), float(deviations[k, 0, axis])
+            law = truncnorm((-1 - mean) / deviation, (1 - mean) / deviation, mean, deviation)
+            assert kstest(places[k, :, axis].numpy(), law.cdf).pvalue > 0.01
+            expected[k] += law.logpdf(places[k, :, axis].numpy())
+    # But for one factor.
+    np.testing.assert_allclose((density.numpy() - expected).std(), 0, atol=1e-9)
+
+
+def test_a_place_is_where_a_level_comes_from() -> None:
+    space = ParameterSpace({"x": intervals(-4, 4, 8), "n": points([1, 2, 7]), "one": points([3])})
+    drawn = torch.rand(1, 50, 3, generator=torch.Generator().manual_seed(1)).double() * 2 - 1
+    levels = space.at(drawn, [torch.Generator()])
+    again = space.at(space.place(levels), [torch.Generator()])
+    for name in ("x", "n", "one"):
+        torch.testing.assert_close(again[name], levels[name])
+
+
+def paced(task: Scripted, **options: Any) -> SelfPacedCurriculum:
+    target: Any = None  # whose shares are known
+    numbers = {"episodes": 24, "epsilon": 0.2, **options}
+    return SelfPacedCurriculum(task.space, target, task.target_shares, **numbers)
+
+
+def test_it_goes_to_the_target_where_the_student_succeeds_and_waits_where_not() -> None:
+    skills = torch.ones(3, 9)
+    skills[1, 5:] = 0.0
+    skills[2] = 0.0
+    task = Scripted(skills, batch_size=24)
+    curriculum = paced(task, delta=0.6)
+    for update in range(40):
+        last = step(curriculum, task, update)
+    told = curriculum.log()
+    assert (last[0] == 8).all() and told["target_divergence"][0] < 0.01
+    solved = float((last[1] < 5).double().mean())
+    assert 0.4 < solved < 0.95 and told["expected_performance"][1] > 0.5
+    assert told["means"][2] == [0.0] and told["deviations"][2] == [0.5]  # nothing to go by
+    assert sum(told["histogram"]) == 3 * 40 * 24
+
+
+def test_levels_are_as_they_are_and_the_target_is_exact() -> None:
+    space = prl.Parameters({"x": (0.0, 10.0)}, target={"x": 9.3})
+    curriculum = prl.Teacher(
+        prl.curricula.spdl(rounded=False, episodes=30, epsilon=0.5, start={"x": -1.0}), space
+    )
+    first = curriculum.propose(30)["x"]
+    assert first.min() >= 0 and float(first.median()) < 2.5
+    for _ in range(30):
+        curriculum.observe({"return": [0.0] * 30, "success": [1.0] * 30})
+        drawn = curriculum.propose(30)["x"]
+    assert float(drawn.mean()) == pytest.approx(9.3, abs=0.05)
+    assert float(drawn.std()) == pytest.approx(0.05, abs=0.02)  # of a least deviation of 0.01
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"start": {"b": 0.0}}, "^start.b: unknown; there are: place$"),
+        ({"deviation": 0.1, "least_deviation": 0.2}, "^deviation=0.1: must be at least least_dev"),
+        ({"epsilon": 0.0}, "^epsilon=0.0: input should be greater than 0$"),
+        ({"rounded": False}, "^rounded=false: SimpleNamespace has bins alone"),
+    ],
+)
+def test_what_is_out_of_bounds_is_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(prl.ArgumentError, match=message):
+        paced(Scripted(torch.zeros(1, 3)), **options)
+
+
+def test_an_outcome_without_success_is_refused_and_counts_nothing() -> None:
+    curriculum = paced(Scripted(torch.zeros(1, 3)))
+    batch = curriculum.propose(Student(), 4, [Streams(0)])
+    outcome = reached(torch.ones(1, 4))
+    with pytest.raises(ValueError, match="measure=success: the outcome has no success"):
+        curriculum.observe(Student(), batch, outcome.exclude("success"))
+    curriculum.observe(Student(), batch, outcome)
