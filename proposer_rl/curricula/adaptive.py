@@ -1,23 +1,26 @@
-"""A mixture of the target, uniform sampling and a way between them; its shares follow what is seen.
+"""A mixture of the target, uniform sampling and a way between them, by what is seen of each.
 
-Every batch has three arms: levels of the **target** itself; **uniform** ones of the whole space; and
-the **way**: levels that a belief holds for mastered, as near to the target as there are. With b what
-was seen of success on the target lately (below), their shares are
+Every batch has three arms: levels of the **target** itself; **uniform** ones of the whole space;
+and the **way**: levels that a belief holds for mastered, as near to the target as there are. With b
+the success on the target lately, their shares are
 
     t = low + (HIGH - low) b / (b + HALF),      w = (1 - t) q,      u = (1 - t) (1 - q).
 
 The target gets more the more often it is solved: there training pays most. While it is never
 solved, ``low`` lies between FLOOR, where all of its episodes return the same and so teach nothing,
-and LOW, where they differ as much as any others. Of what is left the way gets a part q that grows
-with the skill of the belief, 1 - its squared errors on uniform levels over those of their mean.
-Uniform sampling is never given up, as beliefs may be wrong: with little skill it leads.
+and LOW, where they differ at least half as much as all episodes do. Of what is left the way gets a
+part q that grows with the skill of the belief, 1 - its squared errors on uniform levels over those
+of their mean. Uniform sampling is never given up, as beliefs may be wrong; with little skill it
+leads. b is the largest that was seen, which fades with the half-life LATER, so that a target that
+is forgotten while others are trained on is not left alone.
 
 For the way, each of some draws of the target gets the candidate of its own that is nearest to it
 among those whose expected success is at least ``delta``, by optimal assignment with squared
-distances, less a bonus for learnability, 4 p (1 - p). Candidates are new levels of the space and
-levels between those of the last batch's way and the target (where the space knows what lies between
-two levels): the interpolation of Klink et al. 2022, "Curriculum Reinforcement Learning via
-Constrained Optimal Transport" (ICML), with particles in place of bins.
+distances, less a bonus for learnability, 4 p (1 - p). Where too few are expected to succeed so
+often, the best take their place. Candidates are new levels of the space and levels between those
+of the last batch's way and the target, where the space knows what lies between two levels: the
+interpolation of Klink et al. 2022, "Curriculum Reinforcement Learning via Constrained Optimal
+Transport" (ICML), with particles in place of bins, and no pace but what is mastered.
 """
 
 from __future__ import annotations
@@ -46,6 +49,16 @@ Inputs = Callable[[Levels], Tensor]
 
 ARMS = ("target", "uniform", "way")
 TARGET, UNIFORM, WAY = range(3)
+SUMS = (
+    *("levels", "successes", "labels", "squared labels"),
+    *("errors", "returns", "squared returns"),
+)
+FLOOR, LOW, HIGH = 0.1, 0.25, 0.9  # of the share of the target
+HALF, HALF_OF_RETURNS = 0.1, 0.5  # b at half of the way from low to HIGH; where success is not told
+WAY_LEAST, WAY_AT_ONCE, WAY_MOST = 0.2, 0.4, 0.8  # part q: with no skill it is that in the middle
+SOON, LATER = 6.0, 20.0  # half-lives in batches: of sums, and of b where success falls again
+RARE = 0.02  # share of successes, below which the belief learns from returns, too
+LEARNABLE = 0.2  # of the bonus, in squared distances per input
 NEAR = 0.025  # standard deviation of what is added between two levels, in shares of a range
 AT_ONCE = 64  # levels of the way that are assigned to draws of the target together
 FORBIDDEN = 1e3  # cost of a candidate that is not mastered
@@ -73,7 +86,7 @@ class AdaptiveMixture(Curriculum):
         times: candidates for each level of the way.
     """
 
-    remembers = ("_inbox", "_sums", "_best", "_lowest", "_highest", "_told", "_common")
+    remembers = ("_inbox", "_sums", "_best", "_range", "_told")
 
     @checked
     def __init__(
@@ -85,32 +98,15 @@ class AdaptiveMixture(Curriculum):
         delta: Share = 0.3,
         half_life: Annotated[float, Ge(1)] = 12.0,
         times: Count = 4,
-        learn: float = 0.2,
-        floor: Share = 0.1,
-        low: float = 0.25,
-        high: float = 0.9,
-        half: float = 0.1,
-        memory: float = 6.0,
-        remember: float = 20.0,
-        skilled: float = 0.4,
-        shares: list[float] | None = None,
-        grades: bool = True,
-        least: float = 0.2,
     ) -> None:
-        self._grades, self._least = grades, least
         self._space, self._target = space, target
         self._known = inputs or partial(level_inputs, space)
         self._delta, self._half_life, self._times = delta, half_life, times
-        self._learn, self._floor, self._low, self._high = learn, floor, low, high
-        self._half, self._memory, self._remember, self._skilled = half, memory, remember, skilled
-        self._given = shares
         self._inbox = Inbox()
         self._belief: Belief | None = None
-        self._sums = torch.zeros(0, len(ARMS), 7, dtype=torch.float64)
-        self._best = torch.zeros(0, dtype=torch.float64)  # label of the target
-        self._lowest = torch.full((0,), torch.inf, dtype=torch.float64)  # return
-        self._highest = -self._lowest
-        self._common = torch.zeros(2, 0, dtype=torch.float64)
+        self._sums = torch.zeros(0, len(ARMS), len(SUMS), dtype=torch.float64)
+        self._best = torch.zeros(0, dtype=torch.float64)  # success on the target, b
+        self._range = torch.zeros(2, 0, dtype=torch.float64)  # lowest and highest return
         self._told = False  # whether success is told
         self._last: dict[str, Levels] = {}  # on the way, of each student [m]
         self._seen: list[tuple[Tensor, Tensor]] = []  # what was predicted, and its label [K, m]
@@ -180,67 +176,72 @@ class AdaptiveMixture(Curriculum):
         self._belief = Belief(students, width, items, half_life=self._half_life)
         self._sums = self._sums.new_zeros(students, *self._sums.shape[1:])
         self._best = self._best.new_zeros(students)
-        self._lowest = self._lowest.new_full((students,), torch.inf)
-        self._highest = -self._lowest
-        self._common = self._common.new_zeros(2, students)
+        ends = torch.tensor([[torch.inf], [-torch.inf]], dtype=torch.float64)
+        self._range = ends.expand(2, students)
 
     def _take_in(self) -> None:
         """Learns from the outcomes since the last proposal."""
         for seen in self._inbox.take():
             assert self._belief is not None
-            labels = self._labels(seen)
+            returns = seen["return"]
+            success, labels = self._labels(returns, seen.get("success", None))
             self._belief.grow_older()
             self._belief.observe(seen["inputs"], labels, seen.get("items", None))
             self._seen.append((seen["predicted"], labels))
-            error, returns = (seen["predicted"] - labels).square(), seen["return"]
-            won = seen["success"] if self._told else labels
-            rows = [torch.ones_like(labels), won, error, returns, returns.square(), labels, labels.square()]
-            of = F.one_hot(seen["arm"], len(ARMS)).double().mT
-            faded = 0.5 ** (1 / self._memory) * self._sums
-            self._sums = faded + of @ torch.stack(rows, -1)
+            of = {
+                "levels": torch.ones_like(labels),
+                "successes": success,
+                "labels": labels,
+                "squared labels": labels.square(),
+                "errors": (seen["predicted"] - labels).square(),
+                "returns": returns,
+                "squared returns": returns.square(),
+            }
+            rows = torch.stack([of[name] for name in SUMS], -1)
+            arms = F.one_hot(seen["arm"], len(ARMS)).double().mT
+            self._sums = 0.5 ** (1 / SOON) * self._sums + arms @ rows
             tried, won = self._sums[:, TARGET, :2].unbind(-1)
-            faded = 0.5 ** (1 / self._remember) * self._best
+            faded = 0.5 ** (1 / LATER) * self._best
             self._best = torch.maximum(faded, won / (tried + FAILURES))
 
-    def _labels(self, seen: TensorDictBase) -> Tensor:
-        """Returns successes, or where returns lie between the lowest and the highest: [K, m]."""
-        returns = seen["return"]
-        self._lowest = torch.minimum(self._lowest, returns.amin(1))
-        self._highest = torch.maximum(self._highest, returns.amax(1))
-        self._told = "success" in seen.keys()
-        if self._told:
-            self._common = 0.5 ** (1 / 6) * self._common + torch.stack([seen["success"].sum(1), torch.full_like(self._best, seen["success"].shape[1])])
-            if self._grades and bool((self._common[0] >= 0.02 * self._common[1]).all()):
-                return seen["success"]
-        low, high = self._lowest.unsqueeze(1), self._highest.unsqueeze(1)
-        wide = (high - low) > EQUAL * torch.maximum(high.abs(), low.abs())
-        grade = torch.where(wide, (returns - low) / (high - low), 0.5)
-        if not self._told:
-            return grade
-        rare = (self._common[0] < 0.02 * self._common[1]).unsqueeze(1) & bool(self._grades)
-        return torch.where(rare, torch.maximum(seen["success"], grade / 2), seen["success"])
+    def _labels(self, returns: Tensor, success: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Returns what counts as success on levels, and what the belief learns, float64 [K, m]."""
+        extremes = torch.stack([returns.amin(1), -returns.amax(1)])
+        sign = torch.tensor([[1.0], [-1.0]], dtype=torch.float64)
+        self._range = sign * torch.minimum(sign * self._range, extremes)
+        low, high = self._range.unsqueeze(-1)
+        wide = high - low > EQUAL * torch.maximum(high.abs(), low.abs())
+        grades = torch.where(wide, (returns - low) / (high - low), 0.5)
+        self._told = success is not None
+        if success is None:
+            return grades, grades
+        tried, won = self._sums[..., :2].sum(1).unbind(-1)
+        rare = won + success.sum(1) < RARE * (tried + success.shape[1])
+        return success, torch.where(rare.unsqueeze(1), torch.maximum(success, grades / 2), success)
 
     def _shares(self) -> Tensor:
         """Returns the shares of the arms in the next batch, float64 [K, 3]."""
-        number, _, error, returns, squares, label, label2 = self._sums.unbind(-1)
+        sums = dict(zip(SUMS, self._sums.unbind(-1), strict=True))
+        count = sums["levels"]
 
-        def variance(number: Tensor, mean: Tensor, square: Tensor) -> Tensor:
-            return (square / number - (mean / number).square()).clamp(min=0)
+        def variance(name: str, of: Callable[[Tensor], Tensor]) -> Tensor:
+            """Returns the variance of what was summed up, of some arms: [K]."""
+            number, total, squares = (of(sums[n]) for n in ("levels", name, f"squared {name}"))
+            return (squares / number - (total / number).square()).clamp(min=0)
 
-        every = variance(number.sum(1), returns.sum(1), squares.sum(1))
-        own = variance(number, returns, squares)[:, TARGET]
-        signal = (own / every).sqrt().nan_to_num(1.0, posinf=1.0).clamp(max=1)
-        constant = (number * variance(number, label, label2))[:, UNIFORM].nan_to_num(0.0)
-        skill = 1 - (error[:, UNIFORM] + 1) / (constant + 1)
-        low = self._floor + (self._low - self._floor) * (2 * signal).clamp(max=1)
-        half = self._half if self._told else 0.5
-        target = low + (self._high - low) * self._best / (self._best + half)
+        own = variance("returns", lambda one: one[:, TARGET])
+        signal = (own / variance("returns", lambda one: one.sum(1))).sqrt()
+        signal = signal.nan_to_num(1.0, posinf=1.0).clamp(max=1)  # before anything is seen
+        number = count[:, UNIFORM]
+        constant = (number * variance("labels", lambda one: one[:, UNIFORM])).nan_to_num(0.0)
+        skill = 1 - (sums["errors"][:, UNIFORM] + 1) / (constant + 1)
+        low = FLOOR + (LOW - FLOOR) * (2 * signal).clamp(max=1)
+        half = HALF if self._told else HALF_OF_RETURNS
+        target = low + (HIGH - low) * self._best / (self._best + half)
         if self._target is None:
             target = torch.zeros_like(target)
-        way = (self._skilled + 0.5 * skill).clamp(self._least, 0.8)
+        way = (WAY_AT_ONCE + skill / 2).clamp(WAY_LEAST, WAY_MOST)
         shares = torch.stack([target, (1 - target) * (1 - way), (1 - target) * way], -1)
-        if self._given is not None:
-            shares = torch.tensor([self._given] * len(shares), dtype=torch.float64)
         self._shown |= {
             "shares": {arm: shares[:, i].tolist() for i, arm in enumerate(ARMS)},
             "target_success": self._best.tolist(),
@@ -271,7 +272,7 @@ class AdaptiveMixture(Curriculum):
         only = slice(k, k + 1)
         p = self._belief.predict(x[None], None if items is None else items[None], only)[0]
         allowed = p >= p.topk(count).values[-1].clamp(max=self._delta)
-        extra = torch.where(allowed, -self._learn * 4 * p * (1 - p), FORBIDDEN)
+        extra = torch.where(allowed, -LEARNABLE * 4 * p * (1 - p), FORBIDDEN)
         chosen = []
         for start in range(0, count, AT_ONCE):
             end = min(start + AT_ONCE, count)
@@ -282,7 +283,7 @@ class AdaptiveMixture(Curriculum):
         return self._last[str(k)]
 
     def _candidates(self, k: int, count: int, targets: Levels, draw: torch.Generator) -> Levels:
-        """Returns levels [n] of the space and, if it can tell, on the way to those of the target."""
+        """Returns levels [n] of the space and, if it can tell, between the last way and targets."""
         space: Any = self._space
         if not hasattr(space, "between"):
             return space.sample(count, draw)
@@ -303,7 +304,11 @@ class AdaptiveMixture(Curriculum):
         }
 
     def _inputs(self, levels: Levels) -> Tensor:
-        return self._known(levels).double().cpu()
+        known = self._known(levels).double().cpu()
+        if not known.isfinite().all():
+            wrong = (~known.isfinite()).sum()
+            raise ValueError(f"inputs: {wrong} of {known.numel()} numbers are not finite")
+        return known
 
     def _items(self, levels: Levels) -> Tensor | None:
         space: Any = self._space

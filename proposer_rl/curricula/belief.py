@@ -6,10 +6,10 @@ The log odds of success on a level with inputs x in [-1, 1]^D are
 
 with random Fourier features ``waves`` of several lengths (Rahimi and Recht 2007, "Random Features
 for Large-Scale Kernel Machines", NeurIPS), and for levels that come back one by one, such as the
-items of a data set, what is item i's own, u_i. Both have normal distributions. A batch moves them to
-the maximum of their posterior, by Newton's method, with the curvature there as the new precision
+items of a data set, what is item i's own, u_i. Both have normal distributions. A batch moves them
+to the maximum of their posterior, by Newton's method, with the curvature there as the new precision
 (Laplace's approximation, one batch after another: Spiegelhalter and Lauritzen 1990, "Sequential
-updating of conditional probabilities on directed graphical structures", Networks 20). So its cost is
+updating of conditional probabilities on directed graphical structures", Networks 20). Its cost is
 linear in the levels of the batch, and nothing is kept of earlier ones.
 
 Students move. At every batch, with lambda = 2 ** (-1 / half_life), what was known fades towards the
@@ -17,12 +17,14 @@ prior, precision P and P beta alike:
 
     P <- lambda P + (1 - lambda) P_0,      P beta <- lambda P beta,
 
-which gives a level that is ``age`` batches old the weight 2 ** (-age / half_life). The second column
-is a level's age, 0 now and one half-life more after each half_life of batches: a trend. Growing
-older by a batch is a linear map A of the columns, so that before beta <- A^-T beta and P <- A P A^T.
+so that a level that is ``age`` batches old has the weight 2 ** (-age / half_life). The second
+column is minus a level's age in half-lives, 0 now: a trend. Growing older by a batch is a linear
+map A of the columns, so that first beta <- A^-T beta and P <- A P A^T.
 
 The expectation of success is that of MacKay 1992, "The evidence framework applied to classification
-networks" (Neural Computation 4): with s^2 the variance of z, 1 / (1 + exp(-z / sqrt(1 + pi s^2 / 8))).
+networks" (Neural Computation 4): with s^2 the variance of z,
+
+    p = 1 / (1 + exp(-z / sqrt(1 + pi s^2 / 8))).
 """
 
 from __future__ import annotations
@@ -127,13 +129,12 @@ class Belief:
         if items is not None:
             self._observe_items(items, z, labels)
 
-    def predict(
-        self, inputs: Tensor, items: Tensor | None = None, of: slice = EVERY
-    ) -> Tensor:
+    def predict(self, inputs: Tensor, items: Tensor | None = None, of: slice = EVERY) -> Tensor:
         """Returns the probability of success on levels, float64 [K, n].
 
         Args:
-            inputs, items: as of :meth:`observe`.
+            inputs: as of :meth:`observe`.
+            items: likewise.
             of: some of the students, whose number K then is.
         """
         if self._covariance is None:

@@ -309,7 +309,8 @@ class ParameterSpace:
         """Returns levels [n] at random places between two each, [n], parameter by parameter.
 
         Args:
-            a, b: levels of the space, or b of a target.
+            a: levels of the space.
+            b: likewise, or of a target.
             noise: its standard deviation along each parameter, in shares of the range.
             generator: of the CPU.
         """

@@ -1,4 +1,4 @@
-"""The belief: against scikit-learn, a weighted regression, exact posteriors, and a moving learner."""
+"""The belief against scikit-learn, a weighted regression, exact posteriors, a moving learner."""
 
 from __future__ import annotations
 
