@@ -17,7 +17,7 @@ from proposer_rl.task.protocols import Space as Space
 from proposer_rl.task.protocols import check_distributions as check_distributions
 from proposer_rl.task.protocols import distribution_of as distribution_of
 from proposer_rl.task.protocols import for_copies as for_copies
+from proposer_rl.task.protocols import level_inputs as level_inputs
 from proposer_rl.task.protocols import named as named
 from proposer_rl.task.protocols import refuse_single_bin as refuse_single_bin
-from proposer_rl.task.protocols import level_inputs as level_inputs
 from proposer_rl.task.protocols import space_features as space_features
