@@ -110,7 +110,7 @@ def make(
     It gets by the names of its parameters:
 
     - ``task``, ``proposer`` and ``seeds`` of the run; ``space``, ``target``, ``target_shares``,
-      ``features``, ``inputs`` and ``edit`` of the task, those with a default only where the task has them;
+      ``features``, ``inputs`` and ``edit`` of the task, those with a default where it has them;
     - a :class:`Scorer` or :class:`ReplayRule`, made of the settings that these take;
     - the other settings.
 
