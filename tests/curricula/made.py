@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from proposer_rl.curricula import (
+    AdaptiveMixture,
     BoundsCurriculum,
     Curriculum,
     Filtered,
@@ -160,6 +161,7 @@ MADE: dict[str, Make] = {
         SPACE, TARGET, TASK.target_shares, delta=0.01, episodes=6, measure="return"
     ),
     "currot": lambda: TransportCurriculum(SPACE, TASK.target_shares, delta=0.2, every=2, probes=2),
+    "adaptive_mixture": lambda: AdaptiveMixture(SPACE, TARGET, TASK.inputs),
     "first order": lambda: FirstOrderCurriculum(SPACE, TARGET, target_levels=8, candidates=2),
     "first order, sampled": lambda: SampledFirstOrderCurriculum(SPACE, TASK.target_shares),
     "filtered bins": lambda: filtered(

@@ -156,7 +156,7 @@ def test_the_order_in_which_parts_come_back_has_no_effect(name: str) -> None:
 
 
 LEARNING = ["plr", "accel", "progress of episodes", "alp_gmm", "first order, sampled", "paired"]
-LEARNING += ["adr", "spdl"]
+LEARNING += ["adr", "spdl", "adaptive_mixture"]
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,7 @@ WRONG: dict[str, tuple[Callable[[Batch, TensorDict], tuple[Batch, TensorDictBase
 
 
 @pytest.mark.parametrize(
-    "name", ["plr", "progress of episodes", "alp_gmm", "paired", "filter on a model"]
+    "name", ["plr", "progress of episodes", "alp_gmm", "adaptive_mixture", "paired", "filter on a model"]
 )
 @pytest.mark.parametrize("wrong", WRONG)
 def test_what_does_not_fit_is_refused_and_counts_nothing(name: str, wrong: str) -> None:

@@ -134,6 +134,7 @@ FREE = {  # of what needs nothing of a learner, settings that are small
     "learning_progress": {"source": "episodes"},
     "adr": {"episodes": 2},
     "spdl": {"episodes": 8},
+    "adaptive_mixture": {},
     "model_transport": {"probes": 1},
     "mixture": {"parts": {"currot": {"probes": 1}}},
 }
