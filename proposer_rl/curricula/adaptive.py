@@ -266,7 +266,8 @@ class AdaptiveMixture(Curriculum):
     def _way(self, k: int, count: int, draw: torch.Generator) -> Levels:
         """Returns levels [n] that are mastered, and near to the target."""
         assert self._belief is not None
-        targets = (self._target or self._space).sample(count, draw)
+        goal = self._space if self._target is None else self._target
+        targets = goal.sample(count, draw)
         levels = self._candidates(k, self._times * count, targets, draw)
         goals, x, items = self._inputs(targets), self._inputs(levels), self._items(levels)
         only = slice(k, k + 1)

@@ -26,6 +26,9 @@ DRAWN = "level"  # the entry that holds a generator's tensors
 Ranges = Mapping[str, Any]
 T = TypeVar("T")
 
+Features = Callable[[Any], Any]
+"""Gives numbers [n, F] that tell levels [n] apart, each about -1 to 1."""
+
 
 class LevelSpace:
     """A task of levels alone, as curricula take one.
@@ -35,6 +38,8 @@ class LevelSpace:
     """
 
     distributions: Mapping[str, Distribution]
+    _features: Features | None = None
+    _width: int | None = None  # of a row of features, once there was one
 
     @property
     def space(self) -> LevelSpace:
@@ -58,8 +63,29 @@ class LevelSpace:
         return {"kind": type(self).__qualname__}
 
     def features(self, levels: Levels) -> Tensor:
-        """Returns what a model of outcomes knows of levels: float [*B, F]."""
-        return space_features(self, levels)
+        """Returns what a model of outcomes knows of levels: float [*B, F].
+
+        Raises:
+            ArgumentError: if a function gives it, and no finite numbers, F of each level.
+        """
+        if self._features is None:
+            return space_features(self, levels)
+        shape = levels.shape
+        with callers_state():
+            known = _feature_table(self._features(self.given(levels.reshape(-1))))
+        if known.ndim != 2 or len(known) != shape.numel():
+            raise ArgumentError(
+                f"features={list(known.shape)}: must give a row of numbers for each of "
+                f"{shape.numel()} levels"
+            )
+        self._width = known.shape[1] if self._width is None else self._width
+        if known.shape[1] != self._width:
+            raise ArgumentError(
+                f"features={list(known.shape)}: must give rows of one length, first {self._width}"
+            )
+        if not known.isfinite().all():
+            raise ArgumentError(f"features={shown(known.tolist())}: must give finite numbers")
+        return known.reshape(*shape, known.shape[1])
 
     def given(self, levels: Levels) -> Any:
         """Returns levels [*B] as a loop gets them."""
@@ -246,6 +272,7 @@ class Items(LevelSpace):
             raise ArgumentError(
                 f"features={list(lines.shape)}: must have a row of finite numbers for each item"
             )
+        self._known = 0 if features is None else lines.shape[1]
         low, high = lines.amin(0), lines.amax(0)
         self.coordinates = (2 * (lines - low) / (high - low).clamp_min(1e-12) - 1).float()
         parts: dict[str, _SomeItems] = {}
@@ -276,6 +303,14 @@ class Items(LevelSpace):
     def locate(self, levels: TensorDictBase) -> Tensor:
         """Returns where items lie, float32 [*B, D]."""
         return self.coordinates[levels["item"]]
+
+    def inputs(self, levels: TensorDictBase) -> Tensor:
+        """Returns what a belief knows of items, float32 [*B, D]; a place in a list says nothing."""
+        return self.locate(levels)[..., : self._known]
+
+    def items(self, levels: TensorDictBase) -> Tensor:
+        """Returns the places of items, int64 [*B], each with a memory of its own."""
+        return levels["item"]
 
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
         """Returns the items themselves."""
@@ -313,6 +348,8 @@ class LevelGenerator(LevelSpace):
         target: the same for what is to be mastered; None for no target.
         edit: ``edit(levels, count, generator)``: levels [n] after so many small random edits; None
             where levels cannot be edited.
+        features: ``features(levels)`` gives numbers [n, F] that tell levels [n] apart, each about
+            -1 to 1; None for none.
         named: further functions like ``draw``, by name, for hand-designed curricula.
 
     Raises:
@@ -325,8 +362,10 @@ class LevelGenerator(LevelSpace):
         *,
         target: Callable[[int, torch.Generator], Any] | None = None,
         edit: Callable[[Any, int, torch.Generator], Any] | None = None,
+        features: Features | None = None,
         named: Mapping[str, Callable[[int, torch.Generator], Any]] | None = None,
     ) -> None:
+        self._features = features
         drawn = _distributions(target, named)
         parts = {name: _Drawn(name, function) for name, function in drawn.items()}
         self.distributions = {"all": _Drawn("draw", draw), **parts}
@@ -336,6 +375,10 @@ class LevelGenerator(LevelSpace):
     def sample(self, count: int, generator: torch.Generator) -> Levels:
         """Draws levels [count]."""
         return self.distributions["all"].sample(count, generator)
+
+    def inputs(self, levels: Levels) -> Tensor:
+        """Returns the features of levels, float [*B, F]; without a function, F is 0."""
+        return torch.zeros(*levels.shape, 0) if self._features is None else self.features(levels)
 
     def given(self, levels: Levels) -> Any:
         """Returns levels as the function gives them."""

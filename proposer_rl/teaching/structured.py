@@ -10,9 +10,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.settings import ArgumentError
-from proposer_rl.task import Levels
 from proposer_rl.tasks.parameters import ParameterSpace
-from proposer_rl.teaching.spaces import DRAWN, LevelSpace, Parameters, Ranges
+from proposer_rl.teaching.spaces import DRAWN, Features, LevelSpace, Parameters, Ranges
 
 Make = Callable[[TensorDictBase, torch.Generator], Any]
 
@@ -27,8 +26,8 @@ class MadeLevels(Parameters):
         ranges: of each parameter, by name; see :class:`Parameters`.
         make: ``make(values, generator)`` gives levels [n] of a tensordict of values [n]: a tensor
             or a tensordict.
-        features: ``features(levels)`` gives what a model of outcomes knows of levels [*B], float
-            [*B, F], each about -1 to 1; None for the parameters alone.
+        features: ``features(levels)`` gives what a model of outcomes knows of levels [n], numbers
+            [n, F], each about -1 to 1; None for the parameters alone.
         bins, target, named: see :class:`Parameters`.
 
     Raises:
@@ -48,7 +47,7 @@ class MadeLevels(Parameters):
         ranges: Ranges,
         make: Make,
         *,
-        features: Callable[[Any], Tensor] | None = None,
+        features: Features | None = None,
         bins: int | Mapping[str, int] = 8,
         target: Ranges | None = None,
         named: Mapping[str, Ranges] | None = None,
@@ -67,11 +66,9 @@ class MadeLevels(Parameters):
             raise ArgumentError(f"make={shape}: must give {len(kept)} levels, [{len(kept)}, ...]")
         return TensorDict({**kept, DRAWN: levels}, kept.batch_size)
 
-    def features(self, levels: Levels) -> Tensor:
-        """Returns the features of levels for a model of outcomes: float [*B, F]."""
-        if self._features is None:
-            return super().features(levels)
-        return self._features(self.given(levels))
+    def inputs(self, levels: TensorDictBase) -> Tensor:
+        """Returns what a belief knows of levels: their features, or else their parameters."""
+        return super().inputs(levels) if self._features is None else self.features(levels)
 
     def given(self, levels: TensorDictBase) -> Any:
         """Returns levels [*B] as the function made them."""

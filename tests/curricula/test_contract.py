@@ -215,7 +215,8 @@ WRONG: dict[str, tuple[Callable[[Batch, TensorDict], tuple[Batch, TensorDictBase
 
 
 @pytest.mark.parametrize(
-    "name", ["plr", "progress of episodes", "alp_gmm", "adaptive_mixture", "paired", "filter on a model"]
+    "name",
+    ["plr", "progress of episodes", "alp_gmm", "adaptive_mixture", "paired", "filter on a model"],
 )
 @pytest.mark.parametrize("wrong", WRONG)
 def test_what_does_not_fit_is_refused_and_counts_nothing(name: str, wrong: str) -> None:

@@ -1,0 +1,425 @@
+"""The adaptive mixture: its shares by hand, its way by brute force, scripted and learning students.
+
+What a student does is a function of the level alone or of a skill, so that what is right is known.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from itertools import permutations
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import settings as profile
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch import Tensor
+
+import proposer_rl as prl
+from proposer_rl.curricula import AdaptiveMixture, Batch, Curriculum, SamplingCurriculum, Student
+from proposer_rl.curricula.adaptive import (
+    FLOOR,
+    HIGH,
+    LOW,
+    TARGET,
+    UNIFORM,
+    WAY,
+    allotted,
+    assigned,
+)
+from proposer_rl.settings import ArgumentError
+from proposer_rl.streams import Streams
+from proposer_rl.task import level_inputs
+
+LINE = prl.Parameters({"x": (0.0, 1.0)}, target={"x": 1.0})
+Reached = dict[str, Tensor]
+Plays = Callable[[Any, torch.Generator], Reached]
+
+
+def teach(
+    curriculum: Curriculum, play: Plays, updates: int, count: int = 32, first: int = 0
+) -> list[Any]:
+    """Returns what was proposed, [1, n], and what came of it, batch by batch."""
+    seen = []
+    for number in range(first, first + updates):
+        batch = curriculum.propose(Student(), count, [Streams(0, number)])
+        reached = play(batch.levels[0], torch.Generator().manual_seed(number))
+        outcome = TensorDict({name: one[None] for name, one in reached.items()}, [1, count])
+        curriculum.observe(Student(), batch, outcome)
+        seen.append((batch, outcome))
+    return seen
+
+
+def following(curriculum: Curriculum, count: int = 32) -> tuple[Batch, dict[str, Any]]:
+    """Returns the next batch, and what is logged then."""
+    batch = curriculum.propose(Student(), count, [Streams(1, 0)])
+    return batch, json.loads(json.dumps({**curriculum.log(), "levels": 0}, allow_nan=False))
+
+
+def below(limit: float) -> Plays:
+    """Success exactly below a place."""
+
+    def play(levels: Any, generator: torch.Generator) -> Reached:
+        won = (levels["x"] < limit).double()
+        return {"return": won - levels["x"] / 8, "success": won}
+
+    return play
+
+
+def by_hand(seen: list[Any], told: bool) -> list[float]:
+    """Returns the shares after a history, from weights by age: the module's formulas."""
+    returns = torch.cat([outcome["return"] for _, outcome in seen], 1)[0]
+    rows: list[tuple[float, int, float, float, float]] = []  # batch, arm, label, predicted, return
+    low, high = math.inf, -math.inf
+    best = []
+    for number, (batch, outcome) in enumerate(seen):
+        came = outcome["return"][0].tolist()
+        low, high = min(low, *came), max(high, *came)
+        labels = [(one - low) / (high - low) for one in came]
+        if told:
+            labels = outcome["success"][0].tolist()
+        arms, predicted = (batch.notes[name][0].tolist() for name in ("arm", "predicted"))
+        rows += zip([number] * len(arms), arms, labels, predicted, came, strict=True)
+        own = [(2 ** ((r[0] - number) / 6), r[2]) for r in rows if r[1] == TARGET]
+        best.append(sum(w * won for w, won in own) / (sum(w for w, _ in own) + 4))
+    age = [len(seen) - 1 - row[0] for row in rows]
+    weight = torch.tensor([2 ** (-one / 6) for one in age], dtype=torch.float64)
+    arm, label, guess = torch.tensor([row[1:4] for row in rows], dtype=torch.float64).unbind(1)
+
+    def variance(values: Tensor, some: Tensor) -> float:
+        share = weight * some / (weight * some).sum()
+        return float((share * (values - (share * values).sum()).square()).sum())
+
+    every, uniform = torch.ones_like(weight), (arm == UNIFORM).double()
+    signal = math.sqrt(variance(returns, (arm == TARGET).double()) / variance(returns, every))
+    b = max(2 ** (-(len(seen) - 1 - i) / 20) * one for i, one in enumerate(best))
+    errors = float((weight * uniform * (guess - label).square()).sum())
+    constant = float((weight * uniform).sum()) * variance(label, uniform)
+    skill = 1 - (errors + 1) / (constant + 1)
+    low = FLOOR + (LOW - FLOOR) * min(2 * signal, 1)
+    t = low + (HIGH - low) * b / (b + (0.1 if told else 0.5))
+    q = min(max(0.4 + skill / 2, 0.2), 0.8)
+    return [t, (1 - t) * (1 - q), (1 - t) * q]
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_shares_are_those_of_the_formulas(told: bool) -> None:
+    """A target that is solved a little at times, not at all in between, and always in the end."""
+
+    def play(levels: Any, generator: torch.Generator) -> Reached:
+        x = levels["x"]
+        limit = 1.1 if now == 1 else 0.5 + now / 40 if now < 12 else 1.4
+        won = (x + 0.3 * torch.rand(len(x), generator=generator) < limit).double()
+        return {"return": 3 * won - x, **({"success": won} if told else {})}
+
+    curriculum, seen = AdaptiveMixture(LINE, LINE.target), []
+    for now in range(16):
+        seen += teach(curriculum, play, 1, 24, now)
+        log = following(curriculum)[1]
+        expected = by_hand(seen, told)
+        shares = [log["shares"][arm][0] for arm in ("target", "uniform", "way")]
+        assert shares == pytest.approx(expected, abs=1e-9)
+
+
+@profile(max_examples=25)
+@given(st.lists(st.floats(0, 1), min_size=3, max_size=3).filter(any), st.integers(0, 50))
+def test_numbers_of_the_arms_are_as_the_shares(raw: list[float], count: int) -> None:
+    shares = torch.tensor(raw, dtype=torch.float64) / sum(raw)
+    drawn = [allotted(shares, count, torch.Generator().manual_seed(i)) for i in range(200)]
+    assert all((arms.diff() >= 0).all() and len(arms) == count for arms in drawn)
+    numbers = torch.stack([arms.bincount(minlength=3) for arms in drawn]).double()
+    assert ((numbers - shares * count).abs() < 1 + 1e-9).all()
+    assert ((numbers.mean(0) - shares * count).abs() < 0.18).all()  # five standard errors
+
+
+def test_assignments_cost_as_little_as_the_best_of_all() -> None:
+    for seed in range(10):
+        costs = torch.rand(3, 6, generator=torch.Generator().manual_seed(seed)).double()
+        best = min(costs[range(3), list(p)].sum() for p in permutations(range(6), 3))
+        found = assigned(costs)
+        assert len(set(found.tolist())) == 3
+        assert float(costs[range(3), found].sum()) == pytest.approx(float(best))
+
+
+def test_the_way_is_mastered_and_nearer_to_the_target_than_uniform_levels() -> None:
+    curriculum = AdaptiveMixture(LINE, LINE.target)
+    teach(curriculum, below(0.5), 12)
+    batch, _ = following(curriculum, 64)
+    arm, p, x = batch.notes["arm"][0], batch.notes["predicted"][0], batch.levels["x"][0]
+    assert (arm == WAY).sum() > 10
+    assert (p[arm == WAY] >= 0.3 - 1e-9).all()
+    assert (x[arm == TARGET] == 1).all()
+    assert float(x[arm == WAY].mean()) > 0.35 > float(x[arm == WAY].amin())
+    assert float(x[arm == WAY].amax()) < 0.7 < float(x[arm == UNIFORM].amax())
+
+
+def test_where_too_few_are_mastered_the_best_take_their_place() -> None:
+    curriculum = AdaptiveMixture(LINE, LINE.target)
+    teach(curriculum, below(0.02), 12)
+    batch, _ = following(curriculum, 64)
+    arm, x = batch.notes["arm"][0], batch.levels["x"][0]
+    assert float(x[arm == WAY].mean()) < 0.4 and (batch.notes["predicted"] < 0.3).any()
+
+
+def shares_after(play: Plays, space: Any = LINE, updates: int = 12) -> dict[str, float]:
+    target = space.distributions.get("target")
+    curriculum = AdaptiveMixture(space, target)
+    teach(curriculum, play, updates)
+    log = following(curriculum)[1]
+    shares = {name: share for name, (share,) in log["shares"].items()}
+    assert sum(shares.values()) == pytest.approx(1) and min(shares.values()) >= 0
+    return shares
+
+
+def test_the_target_gets_little_while_it_is_silent_and_nearly_all_when_solved() -> None:
+    assert shares_after(below(0.5))["target"] == pytest.approx(FLOOR, abs=1e-6)
+    assert 0.8 < shares_after(below(2.0))["target"] < HIGH
+
+    def loud(levels: Any, generator: torch.Generator) -> Reached:
+        noise = torch.rand(len(levels), generator=generator)
+        return {"return": noise, "success": torch.zeros(len(levels))}
+
+    assert shares_after(loud)["target"] == pytest.approx(LOW)
+
+
+def test_a_learner_that_returns_the_same_for_ever_harms_nothing() -> None:
+    for told in (False, True):
+        for same in (0.0, -200.1):
+
+            def play(levels: Any, generator: torch.Generator) -> Reached:
+                every = torch.full((len(levels),), same)  # noqa: B023
+                return {"return": every, **({"success": 0 * every} if told else {})}  # noqa: B023
+
+            shares = shares_after(play)
+            assert min(shares.values()) > 0.05
+
+
+def test_returns_alone_tell_what_is_mastered_and_where_success_is_rare_too() -> None:
+    """Returns fall with x; success is not told, or there is none."""
+
+    def play(levels: Any, generator: torch.Generator) -> Reached:
+        fell = -levels["x"] - 0.1 * torch.rand(len(levels), generator=generator)
+        return {"return": fell, **({"success": torch.zeros(len(levels))} if told else {})}
+
+    for told in (False, True):
+        curriculum = AdaptiveMixture(LINE, LINE.target)
+        teach(curriculum, play, 12)
+        batch, _ = following(curriculum, 64)
+        p, x = batch.notes["predicted"][0], batch.levels["x"][0]
+        assert torch.corrcoef(torch.stack([p, x]))[0, 1] < -0.8
+        if told:  # as half of a success at most
+            assert float(p.max()) < 0.6
+
+
+def test_inputs_that_are_no_numbers_are_refused() -> None:
+    curriculum = AdaptiveMixture(
+        LINE, LINE.target, lambda levels: torch.full((*levels.shape, 2), math.nan)
+    )
+    with pytest.raises(ValueError, match=r"^inputs: 2 of 2 numbers are not finite$"):
+        curriculum.propose(Student(), 4, [Streams(0)])
+
+
+def draw(n: int, generator: torch.Generator) -> Tensor:
+    return torch.rand(n, 2, generator=generator)
+
+
+@pytest.mark.parametrize(
+    ("features", "message"),
+    [
+        (lambda levels: levels[:, 0], r"^features=\[1\]: must give a row .* each of 1 levels$"),
+        (lambda levels: levels / 0, r"^features=\[\[inf, inf\]\]: must give finite numbers$"),
+        (lambda levels: levels[:1].repeat(2, 1), r"^features=\[2, 2\]: .* of 1 levels$"),
+        (lambda levels: [["a"]], r"^features=.*: must be numbers \[N, D\]$"),
+        (
+            lambda levels: levels[:, : 1 + (len(levels) > 1)],
+            r"^features=\[.*, 2\]: must give rows of one length, first 1$",
+        ),
+    ],
+)
+@pytest.mark.parametrize("made", [False, True])
+def test_features_that_are_none_are_refused_in_one_line(
+    features: Any, message: str, made: bool
+) -> None:
+    space: Any = prl.LevelGenerator(draw, features=features)
+    if made:
+        make = lambda values, generator: draw(len(values), generator)  # noqa: E731
+        space = prl.MadeLevels({"x": (0.0, 1.0)}, make, features=features)
+    with pytest.raises(ArgumentError, match=message):
+        prl.Teacher("adaptive_mixture", space).propose(8)
+
+
+def far(levels: Tensor) -> Any:
+    return levels.sum(-1, keepdim=True).sub(1).tolist()
+
+
+def test_a_belief_gets_what_is_known_of_levels() -> None:
+    """Features where there are; else parameters, or nothing: places in a list say nothing."""
+    table = torch.tensor([[0.0, 5.0], [1.0, 5.0], [2.0, 7.0]])
+    values = {"x": (0.0, 4.0), "n": [1, 2, 9], "t": ["a", "b", "c"]}
+    plain = prl.Parameters(values, bins=1)
+    make = lambda values, g: torch.stack([values["x"], values["n"].double()], -1)  # noqa: E731
+    g = torch.Generator().manual_seed(0)
+    for space, width in (
+        (prl.Items(3), 0),
+        (prl.Items(3, features=table), 2),
+        (prl.LevelGenerator(draw), 0),
+        (prl.LevelGenerator(draw, features=far), 1),
+        (plain, 5),
+        (prl.MadeLevels(values, make), 5),
+        (prl.MadeLevels(values, make, features=far), 1),
+    ):
+        levels: Any = torch.stack([space.sample(6, g) for _ in range(2)])
+        known = level_inputs(space, levels)
+        assert known.shape == (2, 6, width) and known.dtype == torch.float64
+        if width == 1:
+            torch.testing.assert_close(
+                known[..., 0], space.given(levels).sum(-1).double() - 1, rtol=1e-6, atol=1e-6
+            )
+        if width == 2:
+            expected = 2 * torch.tensor([[0.0, 0], [0.5, 0], [1, 1]]).double() - 1
+            torch.testing.assert_close(known, expected[levels["item"]])
+    known = level_inputs(plain, levels := plain.sample(40, g))
+    ends = 2 * torch.stack([levels["x"] / 4, (levels["n"] - 1) / 8], -1) - 1
+    torch.testing.assert_close(known[:, :2], ends.double())
+    assert (known[:, 2:] == torch.eye(3)[levels["t"]]).all()
+
+
+def test_items_are_remembered_one_by_one() -> None:
+    """Of 5,000 items without features those that were solved are the way."""
+    space = prl.Items(5000, target=list(range(20)))
+    curriculum = AdaptiveMixture(space, space.target)
+
+    def odd(levels: Any, generator: torch.Generator) -> Reached:
+        won = (levels["item"] % 2).double()
+        return {"return": won, "success": won}
+
+    seen = [batch.levels["item"][0] for batch, _ in teach(curriculum, odd, 30, 256)]
+    batch, log = following(curriculum, 256)
+    arm, item, p = batch.notes["arm"][0], batch.levels["item"][0], batch.notes["predicted"][0]
+    known = torch.isin(item, torch.cat(seen))
+    assert float((item[known & (arm == WAY)] % 2).float().mean()) > 0.9
+    assert p[known & (item % 2 == 1)].mean() > p[~known].mean() > p[known & (item % 2 == 0)].mean()
+    assert (item[arm == TARGET] < 20).all()
+    assert log["shares"]["way"][0] > 0
+
+
+PARTS: dict[str, Any] = {
+    "range": (-2.0, 5.0),
+    "whole": range(-3, 40),
+    "values": [0.5, 1.0, 7.0],
+    "whole values": [1, 2, 30],
+    "texts": ["a", "b", "c"],
+    "one": [4],
+}
+
+
+@profile(max_examples=25)
+@given(st.integers(0, 10**6), st.sampled_from([0.0, 0.025, 2.0]), st.booleans())
+def test_levels_between_two_lie_between_them_and_within_the_space(
+    seed: int, noise: float, bins: bool
+) -> None:
+    space = prl.Parameters(PARTS, bins=3 if bins else 1)
+    g = torch.Generator().manual_seed(seed)
+    a, b = space.sample(20, g), space.sample(20, g)
+    between = space.between(a, b, noise, g)
+    assert {name: one.dtype for name, one in between.items()} == {n: a[n].dtype for n in PARTS}
+    for name, part in PARTS.items():
+        low, high = torch.minimum(a[name], b[name]), torch.maximum(a[name], b[name])
+        value = between[name]
+        if name == "texts":
+            assert ((value == a[name]) | (value == b[name])).all()
+        elif not noise:
+            assert ((value >= low) & (value <= high)).all()
+        if name != "range":
+            known = torch.arange(3) if name == "texts" else torch.tensor([*part])
+            assert torch.isin(value, known.to(value)).all()
+        else:
+            assert ((value >= -2) & (value <= 5)).all()
+    assert noise or (space.between(a, a, 0.0, g) == a).all()
+
+
+MANY = {f"p{i}": (0.0, 1.0) for i in range(12)}
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        prl.Parameters(PARTS, target={"range": 5.0, "texts": "c"}),
+        prl.Parameters(PARTS, target={"range": 5.0}, seeded=True),
+        prl.Parameters({"one": [4]}, target={"one": 4}),
+        prl.Parameters({"texts": ["a", "b"]}, target={"texts": "b"}),
+        prl.Parameters(MANY, bins=1, target=dict.fromkeys(MANY, 1.0)),
+        LINE,
+        prl.Parameters({"x": (0.0, 1.0)}),
+        prl.Items(9),
+        prl.Items(9, features=torch.eye(9), target=[3]),
+        prl.LevelGenerator(draw),
+        prl.LevelGenerator(draw, features=far, target=lambda n, g: torch.ones(n, 2)),
+        prl.MadeLevels({"x": (0.0, 1.0)}, lambda v, g: v["x"].unsqueeze(-1), target={"x": 1.0}),
+    ],
+    ids=lambda space: type(space).__name__,
+)
+def test_any_space_will_do_with_a_target_or_without(space: Any) -> None:
+    teacher = prl.Teacher("adaptive_mixture", space, block=16)
+    for number in range(4):
+        ids, _ = teacher.ask(24)
+        won = torch.rand(24, generator=torch.Generator().manual_seed(number)).round()
+        teacher.tell(ids, won, success=won)
+    teacher.propose(24)
+    shares = teacher.log()["shares"]
+    assert ("target" in space.distributions) == (shares["target"][0] > 0)
+    assert sum(share for (share,) in shares.values()) == pytest.approx(1)
+
+
+def test_a_target_outside_of_the_space_is_refused() -> None:
+    with pytest.raises(ArgumentError, match=r"^target.x=2.0: must lie within 0 to 1$"):
+        prl.Teacher("adaptive_mixture", prl.Parameters({"x": (0.0, 1.0)}, target={"x": 2.0}))
+
+
+class Learner:
+    """Skill grows by levels at its frontier, or by the target alone; success is a matter of it."""
+
+    def __init__(self, only_target: bool) -> None:
+        self.skill, self._only_target = 0.0, only_target
+
+    def __call__(self, levels: Any, generator: torch.Generator) -> Reached:
+        x = levels["x"]
+        if self._only_target:
+            p = torch.where(x == 1, 0.05 + 0.95 * self.skill, 0.5)
+            taught = 0.08 * (x == 1) * (1 - self.skill)
+        else:
+            p = ((self.skill - x) / 0.04).sigmoid()
+            taught = 0.15 * 4 * p * (1 - p)
+        won = (torch.rand(len(x), generator=generator) < p).double()
+        self.skill += float(taught.mean())
+        return {"return": won, "success": won}
+
+
+def updates_until(curriculum: Curriculum, only_target: bool, skill: float, most: int) -> int:
+    """Returns the number of updates until a skill is reached."""
+    learner = Learner(only_target)
+    for number in range(most):
+        teach(curriculum, learner, 1, first=number)
+        if learner.skill >= skill:
+            return number + 1
+    return most
+
+
+def compared(only_target: bool, skill: float, most: int) -> list[int]:
+    made = AdaptiveMixture(LINE, LINE.target), SamplingCurriculum(LINE)
+    alone = SamplingCurriculum(LINE.target)
+    return [updates_until(one, only_target, skill, most) for one in (*made, alone)]
+
+
+def test_where_skill_grows_at_its_frontier_it_beats_uniform_levels_and_the_target() -> None:
+    adaptive, uniform, target = compared(False, 1.0, 80)
+    assert adaptive < 0.7 * uniform and adaptive < 0.7 * target, (adaptive, uniform, target)
+
+
+def test_where_the_target_alone_teaches_it_is_nearly_as_fast() -> None:
+    adaptive, uniform, target = compared(True, 0.9, 120)
+    assert adaptive < 2 * target < uniform, (adaptive, uniform, target)
