@@ -14,7 +14,7 @@ from tests.same_run import assert_same_run, tables, trained
 pytestmark = pytest.mark.usefixtures("own_folder")
 
 SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.updates=3"]
-METHODS = ["perf_gain", "target"]
+METHODS = ["perf_gain", "target", "adaptive_mixture"]
 
 
 def assert_trained_alike(one: Path, other: Path) -> None:
