@@ -144,7 +144,6 @@ class AdaptiveMixture(Curriculum):
         target differ in units of all, and ``skill`` of the belief, each student's; and as
         :func:`~proposer_rl.curricula.outcome_model.calibration`.
         """
-        self._take_in()
         shown, self._shown = self._shown, {}
         if self._seen:
             predicted, label = (torch.cat(one, 1) for one in zip(*self._seen, strict=True))
@@ -186,7 +185,7 @@ class AdaptiveMixture(Curriculum):
             assert self._belief is not None
             returns = seen["return"]
             success, labels = self._labels(returns, seen.get("success", None))
-            batches = min(1.0, labels.shape[1] / FEW)  # that have passed
+            batches = labels.shape[1] / max(int(seen["size"][0, 0]), FEW)  # that have passed
             self._belief.grow_older(batches)
             self._belief.observe(seen["inputs"], labels, seen.get("items", None))
             self._seen.append((seen["predicted"], labels))
