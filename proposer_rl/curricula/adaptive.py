@@ -57,6 +57,7 @@ FLOOR, LOW, HIGH = 0.1, 0.25, 0.9  # of the share of the target
 HALF, HALF_OF_RETURNS = 0.1, 0.5  # b at half of the way from low to HIGH; where success is not told
 WAY_LEAST, WAY_AT_ONCE, WAY_MOST = 0.2, 0.4, 0.8  # part q: with no skill it is that in the middle
 SOON, LATER = 6.0, 20.0  # half-lives in batches: of sums, and of b where success falls again
+FEW = 16  # levels, of which fewer are counted as a part of a batch
 RARE = 0.02  # share of successes, below which the belief learns from returns, too
 LEARNABLE = 0.2  # of the bonus, in squared distances per input
 NEAR = 0.025  # standard deviation of what is added between two levels, in shares of a range
@@ -143,7 +144,6 @@ class AdaptiveMixture(Curriculum):
         target differ in units of all, and ``skill`` of the belief, each student's; and as
         :func:`~proposer_rl.curricula.outcome_model.calibration`.
         """
-        self._take_in()
         shown, self._shown = self._shown, {}
         if self._seen:
             predicted, label = (torch.cat(one, 1) for one in zip(*self._seen, strict=True))
@@ -185,7 +185,8 @@ class AdaptiveMixture(Curriculum):
             assert self._belief is not None
             returns = seen["return"]
             success, labels = self._labels(returns, seen.get("success", None))
-            self._belief.grow_older()
+            batches = labels.shape[1] / max(int(seen["size"][0, 0]), FEW)  # that have passed
+            self._belief.grow_older(batches)
             self._belief.observe(seen["inputs"], labels, seen.get("items", None))
             self._seen.append((seen["predicted"], labels))
             of = {
@@ -199,9 +200,9 @@ class AdaptiveMixture(Curriculum):
             }
             rows = torch.stack([of[name] for name in SUMS], -1)
             arms = F.one_hot(seen["arm"], len(ARMS)).double().mT
-            self._sums = 0.5 ** (1 / SOON) * self._sums + arms @ rows
+            self._sums = 0.5 ** (batches / SOON) * self._sums + arms @ rows
             tried, won = self._sums[:, TARGET, :2].unbind(-1)
-            faded = 0.5 ** (1 / LATER) * self._best
+            faded = 0.5 ** (batches / LATER) * self._best
             self._best = torch.maximum(faded, won / (tried + FAILURES))
 
     def _labels(self, returns: Tensor, success: Tensor | None) -> tuple[Tensor, Tensor]:

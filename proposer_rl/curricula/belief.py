@@ -72,7 +72,7 @@ class Belief:
         def normal(*shape: int) -> Tensor:
             return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
-        self._keep = 0.5 ** (1 / half_life)
+        self._half_life = half_life
         self._project = None
         if inputs > WIDEST:
             self._project, inputs = normal(inputs, WIDEST) / math.sqrt(inputs), WIDEST
@@ -83,19 +83,20 @@ class Belief:
         self._height = math.sqrt(2 * ROUGHNESS * ridge / WAVES)
         size = 2 + 2 * inputs + WAVES
         self._prior = ridge * torch.eye(size, dtype=torch.float64)
-        self._aged, self._back = (torch.eye(size, dtype=torch.float64) for _ in range(2))
-        self._aged[1, 0], self._back[0, 1] = -1 / half_life, 1 / half_life
         self._mean = torch.zeros(students, size, dtype=torch.float64)
         self._precision = self._prior.repeat(students, 1, 1)
         self._own = torch.zeros(students, items, dtype=torch.float64)
         self._known = torch.full_like(self._own, 1 / OWN)  # the precision of that
         self._covariance: Tensor | None = None
 
-    def grow_older(self) -> None:
-        """Lets a batch pass."""
-        old, new = self._keep, 1 - self._keep
-        mean = self._mean @ self._back.mT
-        precision = self._aged @ self._precision @ self._aged.mT
+    def grow_older(self, batches: float = 1.0) -> None:
+        """Lets batches pass, or a part of one."""
+        age = batches / self._half_life
+        old, new = 0.5**age, 1 - 0.5**age
+        aged, back = torch.eye(len(self._prior), dtype=torch.float64).repeat(2, 1, 1)
+        aged[1, 0], back[0, 1] = -age, age
+        mean = self._mean @ back.mT
+        precision = aged @ self._precision @ aged.mT
         self._precision = old * precision + new * self._prior
         self._mean = torch.linalg.solve(self._precision, old * _times(precision, mean))
         weighed = old * self._known * self._own

@@ -89,9 +89,9 @@ class Bins:
         single values the nearest in the line is taken.
         """
         if not self.wide:
-            places = (torch.searchsorted(self.low, end).double() for end in (a, b))
+            start, end = (torch.searchsorted(self.low, one).double() for one in (a, b))
             last = len(self.low) - 1
-            place = torch.lerp(*places, share) + noise * last
+            place = start.lerp(end, share) + noise * last
             return self.low[place.round().long().clamp(0, last)]
         low, high = self.low[0], self.high[-1]
         value = a.double().lerp(b.double(), share) + noise * (high - low)

@@ -8,7 +8,7 @@ from functools import partial
 import torch
 
 from proposer_rl import curricula
-from proposer_rl.teaching import Parameters, Teacher
+from proposer_rl.teaching import Items, Parameters, Teacher
 from research.benchmarks.peer import said_by
 from research.benchmarks.results import Options, Result, Row, Spread
 from research.benchmarks.syllabus_peer import __file__ as SYLLABUS
@@ -16,6 +16,9 @@ from research.benchmarks.timing import interleave, threads
 
 SLOTS, MANY = 4000, 4096
 TARGETS = {"one by one": 20.0, f"{MANY} at once": 2.0}  # microseconds of a level
+RANGES, BATCH = (2, 4, 8, 12), 384
+ITEMS, FEATURES = 100_000, 16
+OF_A_PROPOSAL, OF_A_PAIR, OF_AN_ITEM = 0.030, 60e-6, 5e-6  # targets, seconds
 
 
 def teacher_calls(options: Options) -> Result:
@@ -43,9 +46,48 @@ def teacher_calls(options: Options) -> Result:
         )
         for name in TARGETS
     ]
+    rows += adaptive_mixture(options)
     if options.syllabus is not None:
         rows += beside_syllabus(options.syllabus, 16 if options.tiny else 256, options.repeats)
     return Result(rows)
+
+
+def adaptive_mixture(options: Options) -> list[Row]:
+    """A proposal with more and more parameters, single levels, and many items with features."""
+    items = 500 if options.tiny else ITEMS
+    count = 64 if options.tiny else MANY
+    ways: dict[str, Callable[[], None]] = {}
+    per, targets = {}, {}
+    for size in RANGES[:1] if options.tiny else RANGES:
+        names = [f"x{i}" for i in range(size)]
+        space = Parameters(dict.fromkeys(names, (0.0, 1.0)), target={"x0": (0.8, 1.0)}, bins=1)
+        name = f"a proposal of {BATCH} levels with {size} ranges"
+        ways[name] = partial(_batch, Teacher(curricula.adaptive_mixture(), space), BATCH)
+        per[name], targets[name] = 1, OF_A_PROPOSAL
+        name = f"ask and tell with {size} ranges, one by one, each"
+        ways[name] = partial(_one_by_one, Teacher(curricula.adaptive_mixture(), space), count)
+        per[name], targets[name] = count, OF_A_PAIR
+    known = torch.rand(items, FEATURES, generator=torch.Generator().manual_seed(0))
+    space = Items(items, features=known, target=range(items // 100))
+    name = f"a step of {count} of {items:,} items with {FEATURES} features"
+    ways[name] = partial(_batch, Teacher(curricula.adaptive_mixture(), space), count)
+    per[name], targets[name] = 1, OF_AN_ITEM * items
+    for way in ways.values():
+        way()
+    with threads(1):
+        seconds = interleave(ways, options.repeats)
+    return [
+        Row(
+            f"adaptive mixture, {name}",
+            "a number by itself",
+            Spread.of([each / per[name] for each in seconds[name]]),
+            "ms",
+            target=targets[name],
+            at_most=True,
+            samples={name: seconds[name]},
+        )
+        for name in ways
+    ]
 
 
 def beside_syllabus(python: str, count: int, repeats: int) -> list[Row]:
@@ -67,6 +109,12 @@ def _one_by_one(teacher: Teacher, count: int) -> None:
     for i in range(count):
         ticket, _ = teacher.ask()
         teacher.tell(ticket, i % 7, i % 2)
+
+
+def _batch(teacher: Teacher, count: int) -> None:
+    teacher.propose(count)
+    returns = torch.rand(count)
+    teacher.observe({"return": returns, "success": returns > 0.5})
 
 
 def _at_once(teacher: Teacher, count: int) -> None:

@@ -43,7 +43,8 @@ class BatchedTask(Task):
             range.
     """
 
-    noun, batched = "levels", True
+    noun = "levels"
+    batched: bool | None = True
     replayed = ("rollouts",)
     seeded: ClassVar[bool] = True
 
