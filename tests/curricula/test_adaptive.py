@@ -364,11 +364,14 @@ MANY = {f"p{i}": (0.0, 1.0) for i in range(12)}
     ids=lambda space: type(space).__name__,
 )
 def test_any_space_will_do_with_a_target_or_without(space: Any) -> None:
-    teacher = prl.Teacher("adaptive_mixture", space, block=16)
-    for number in range(4):
-        ids, _ = teacher.ask(24)
-        won = torch.rand(24, generator=torch.Generator().manual_seed(number)).round()
+    """Results come late, out of order, in parts of two batches, and not all of them."""
+    teacher, late = prl.Teacher("adaptive_mixture", space, block=16), []
+    for number in range(6):
+        late += reversed(teacher.ask(24)[0].tolist())
+        ids, late = late[:: 2 + number % 2], late[1::4]
+        won = torch.rand(len(ids), generator=torch.Generator().manual_seed(number)).round()
         teacher.tell(ids, won, success=won)
+        late = [one for one in late if one not in ids]
     teacher.propose(24)
     shares = teacher.log()["shares"]
     assert ("target" in space.distributions) == (shares["target"][0] > 0)
