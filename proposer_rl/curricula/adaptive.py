@@ -104,7 +104,7 @@ class AdaptiveMixture(Curriculum):
         self._known = inputs or partial(level_inputs, space)
         self._delta, self._half_life, self._times = delta, half_life, times
         self._inbox = Inbox()
-        self._belief: Belief | None = None
+        self._beliefs: list[Belief] = []  # of each student
         self._sums = torch.zeros(0, len(ARMS), len(SUMS), dtype=torch.float64)
         self._best = torch.zeros(0, dtype=torch.float64)  # success on the target, b
         self._range = torch.zeros(2, 0, dtype=torch.float64)  # lowest and highest return
@@ -116,13 +116,13 @@ class AdaptiveMixture(Curriculum):
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """Returns levels [K, n] of the three arms, in a random order."""
         self._begin(len(streams))
-        assert self._belief is not None
         self._take_in()
         shares = self._shares()
         made = [self._batch(k, count, shares[k], own) for k, own in enumerate(streams)]
         levels, arms = (torch.stack(one) for one in zip(*made, strict=True))
         inputs, items = self._inputs(levels), self._items(levels)
-        predicted = self._belief.predict(inputs, items)
+        rows = zip(self._beliefs, inputs, _each(items, len(inputs)), strict=True)
+        predicted = torch.stack([belief.predict(x, which) for belief, x, which in rows])
         self._show(levels[0], arms[0])
         notes = {"arm": arms, "inputs": inputs, "predicted": predicted}
         return self._inbox.batch(levels, **notes, **({} if items is None else {"items": items}))
@@ -153,27 +153,28 @@ class AdaptiveMixture(Curriculum):
 
     def state_dict(self) -> dict[str, Any]:
         """Returns also the belief, and the last levels of the way."""
-        belief = {} if self._belief is None else self._belief.state_dict()
+        beliefs = [belief.state_dict() for belief in self._beliefs]
         last = {student: packed(levels) for student, levels in self._last.items()}
-        return {**super().state_dict(), "belief": belief, "last": last}
+        return {**super().state_dict(), "beliefs": beliefs, "last": last}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Puts back what :meth:`state_dict` returned."""
-        if state["belief"]:
-            self._begin(len(state["best"]))
-            assert self._belief is not None
-            self._belief.load_state_dict(state["belief"])
+        if state["beliefs"]:
+            self._begin(len(state["beliefs"]))
+        for belief, own in zip(self._beliefs, state["beliefs"], strict=True):
+            belief.load_state_dict(own)
         super().load_state_dict(state)
         like = type(self._space.sample(1, torch.Generator()))
         self._last = {k: like.from_dict(one, batch_dims=1) for k, one in state["last"].items()}
 
     def _begin(self, students: int) -> None:
-        if self._belief is not None:
+        if self._beliefs:
             return
         one = self._space.sample(1, torch.Generator())
         items = 0 if self._items(one) is None else self._space.size
         width = self._inputs(one).shape[-1]
-        self._belief = Belief(students, width, items, half_life=self._half_life)
+        made = (Belief(width, items, half_life=self._half_life) for _ in range(students))
+        self._beliefs = list(made)
         self._sums = self._sums.new_zeros(students, *self._sums.shape[1:])
         self._best = self._best.new_zeros(students)
         ends = torch.tensor([[torch.inf], [-torch.inf]], dtype=torch.float64)
@@ -182,12 +183,14 @@ class AdaptiveMixture(Curriculum):
     def _take_in(self) -> None:
         """Learns from the outcomes since the last proposal."""
         for seen in self._inbox.take():
-            assert self._belief is not None
             returns = seen["return"]
             success, labels = self._labels(returns, seen.get("success", None))
             batches = labels.shape[1] / max(int(seen["size"][0, 0]), FEW)  # that have passed
-            self._belief.grow_older(batches)
-            self._belief.observe(seen["inputs"], labels, seen.get("items", None))
+            which = _each(seen.get("items", None), len(labels))
+            every = zip(self._beliefs, seen["inputs"], labels, which, strict=True)
+            for belief, x, label, own in every:
+                belief.grow_older(batches)
+                belief.observe(x, label, own)
             self._seen.append((seen["predicted"], labels))
             of = {
                 "levels": torch.ones_like(labels),
@@ -213,7 +216,7 @@ class AdaptiveMixture(Curriculum):
         low, high = self._range.unsqueeze(-1)
         wide = high - low > EQUAL * torch.maximum(high.abs(), low.abs())
         grades = torch.where(wide, (returns - low) / (high - low), 0.5)
-        self._told = success is not None
+        self._told = self._told or success is not None
         if success is None:
             return grades, grades
         tried, won = self._sums[..., :2].sum(1).unbind(-1)
@@ -228,7 +231,9 @@ class AdaptiveMixture(Curriculum):
         def variance(name: str, of: Callable[[Tensor], Tensor]) -> Tensor:
             """Returns the variance of what was summed up, of some arms: [K]."""
             number, total, squares = (of(sums[n]) for n in ("levels", name, f"squared {name}"))
-            return (squares / number - (total / number).square()).clamp(min=0)
+            square = squares / number
+            found = square - (total / number).square()
+            return found.where(found > EQUAL * square, 0.0)
 
         own = variance("returns", lambda one: one[:, TARGET])
         signal = (own / variance("returns", lambda one: one.sum(1))).sqrt()
@@ -266,13 +271,11 @@ class AdaptiveMixture(Curriculum):
 
     def _way(self, k: int, count: int, draw: torch.Generator) -> Levels:
         """Returns levels [n] that are mastered, and near to the target."""
-        assert self._belief is not None
         goal = self._space if self._target is None else self._target
         targets = goal.sample(count, draw)
         levels = self._candidates(k, self._times * count, targets, draw)
         goals, x, items = self._inputs(targets), self._inputs(levels), self._items(levels)
-        only = slice(k, k + 1)
-        p = self._belief.predict(x[None], None if items is None else items[None], only)[0]
+        p = self._beliefs[k].predict(x, items)
         allowed = p >= p.topk(count).values[-1].clamp(max=self._delta)
         extra = torch.where(allowed, -LEARNABLE * 4 * p * (1 - p), FORBIDDEN)
         chosen = []
@@ -315,6 +318,10 @@ class AdaptiveMixture(Curriculum):
     def _items(self, levels: Levels) -> Tensor | None:
         space: Any = self._space
         return space.items(levels) if hasattr(space, "items") else None
+
+
+def _each(items: Tensor | None, students: int) -> Sequence[Tensor | None]:
+    return [None] * students if items is None else list(items)
 
 
 def assigned(costs: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""A belief of what students reach on any level, which is carried from batch to batch.
+"""A belief of what a student reaches on any level, which is carried from batch to batch.
 
 The log odds of success on a level with inputs x in [-1, 1]^D are
 
@@ -12,7 +12,7 @@ to the maximum of their posterior, by Newton's method, with the curvature there 
 updating of conditional probabilities on directed graphical structures", Networks 20). Its cost is
 linear in the levels of the batch, and nothing is kept of earlier ones.
 
-Students move. At every batch, with lambda = 2 ** (-1 / half_life), what was known fades towards the
+The student moves. At every batch, with lambda = 2 ** (-1 / half_life), what was known fades towards the
 prior, precision P and P beta alike:
 
     P <- lambda P + (1 - lambda) P_0,      P beta <- lambda P beta,
@@ -43,15 +43,13 @@ OWN = 1.0  # prior variance of the log odds that are an item's own
 WIDEST = 24  # inputs; more are projected to as many
 STEPS, CLOSE = 12, 1e-4  # of Newton's method, and the change of log odds at which it ends
 LEAP = 3.0  # of log odds in one of its steps, at most
-EVERY = slice(None)
 SURE = 1e-3  # least curvature that a level adds, p (1 - p)
 
 
 class Belief:
-    """Believes how likely K students succeed on levels.
+    """Believes how likely a student succeeds on levels.
 
     Args:
-        students: number K.
         inputs: numbers D that are known of a level.
         items: number N of levels that come back, each with a memory of its own; 0 for none.
         half_life: batches after which a level counts half.
@@ -59,13 +57,7 @@ class Belief:
     """
 
     def __init__(
-        self,
-        students: int,
-        inputs: int,
-        items: int = 0,
-        *,
-        half_life: float = 12.0,
-        ridge: float = 0.3,
+        self, inputs: int, items: int = 0, *, half_life: float = 12.0, ridge: float = 0.3
     ) -> None:
         generator = torch.Generator().manual_seed(0)
 
@@ -83,9 +75,9 @@ class Belief:
         self._height = math.sqrt(2 * ROUGHNESS * ridge / WAVES)
         size = 2 + 2 * inputs + WAVES
         self._prior = ridge * torch.eye(size, dtype=torch.float64)
-        self._mean = torch.zeros(students, size, dtype=torch.float64)
-        self._precision = self._prior.repeat(students, 1, 1)
-        self._own = torch.zeros(students, items, dtype=torch.float64)
+        self._mean = torch.zeros(size, dtype=torch.float64)
+        self._precision = self._prior
+        self._own = torch.zeros(items, dtype=torch.float64)
         self._known = torch.full_like(self._own, 1 / OWN)  # the precision of that
         self._covariance: Tensor | None = None
 
@@ -95,56 +87,48 @@ class Belief:
         old, new = 0.5**age, 1 - 0.5**age
         aged, back = torch.eye(len(self._prior), dtype=torch.float64).repeat(2, 1, 1)
         aged[1, 0], back[0, 1] = -age, age
-        mean = self._mean @ back.mT
         precision = aged @ self._precision @ aged.mT
         self._precision = old * precision + new * self._prior
-        self._mean = torch.linalg.solve(self._precision, old * _times(precision, mean))
+        self._mean = torch.linalg.solve(self._precision, old * (precision @ (back @ self._mean)))
         weighed = old * self._known * self._own
         self._known = old * self._known + new / OWN
         self._own = weighed / self._known
         self._covariance = None
 
     def observe(self, inputs: Tensor, labels: Tensor, items: Tensor | None = None) -> None:
-        """Learns from levels that students were trained on.
+        """Learns from levels that the student was trained on.
 
         Args:
-            inputs: float64 [K, n, D].
-            labels: successes, or shares of them, in [0, 1]: float64 [K, n].
-            items: which of those that come back they are, int64 [K, n]; None where none do.
+            inputs: float64 [n, D].
+            labels: successes, or shares of them, in [0, 1]: float64 [n].
+            items: which of those that come back they are, int64 [n]; None where none do.
         """
         phi, prior, precision = self._columns(inputs), self._mean, self._precision
-        own = torch.zeros_like(labels) if items is None else self._own.gather(1, items)
-        z, mean = _times(phi, prior), prior
+        own = torch.zeros_like(labels) if items is None else self._own[items]
+        z, mean = phi @ prior, prior
         for _ in range(STEPS):
             p = (z + own).sigmoid()
-            slope = _times(phi.mT, p - labels) + _times(precision, mean - prior)
+            slope = phi.mT @ (p - labels) + precision @ (mean - prior)
             step = torch.linalg.solve(precision + _curvature(phi, p), slope)
-            moved = _times(phi, step)
-            size = moved.abs().amax(1, keepdim=True)
+            moved = phi @ step
+            size = moved.abs().max()
             part = LEAP / size.clamp(min=LEAP)
             mean, z = mean - part * step, z - part * moved
-            if float(size.max()) < CLOSE:
+            if float(size) < CLOSE:
                 break
         self._mean, self._covariance = mean, None
         self._precision = precision + _curvature(phi, (z + own).sigmoid())
         if items is not None:
             self._observe_items(items, z, labels)
 
-    def predict(self, inputs: Tensor, items: Tensor | None = None, of: slice = EVERY) -> Tensor:
-        """Returns the probability of success on levels, float64 [K, n].
-
-        Args:
-            inputs: as of :meth:`observe`.
-            items: likewise.
-            of: some of the students, whose number K then is.
-        """
+    def predict(self, inputs: Tensor, items: Tensor | None = None) -> Tensor:
+        """Returns the probability of success on levels, as :meth:`observe` has them: float64 [n]."""
         if self._covariance is None:
             self._covariance = torch.linalg.inv(self._precision)
         phi = self._columns(inputs)
-        z, variance = _times(phi, self._mean[of]), ((phi @ self._covariance[of]) * phi).sum(-1)
+        z, variance = phi @ self._mean, ((phi @ self._covariance) * phi).sum(-1)
         if items is not None:
-            z = z + self._own[of].gather(1, items)
-            variance = variance + 1 / self._known[of].gather(1, items)
+            z, variance = z + self._own[items], variance + 1 / self._known[items]
         return (z / (1 + math.pi / 8 * variance).sqrt()).sigmoid()
 
     def state_dict(self) -> dict[str, Any]:
@@ -158,13 +142,12 @@ class Belief:
         self._covariance = None
 
     def _observe_items(self, items: Tensor, z: Tensor, labels: Tensor) -> None:
-        """Moves what is the items' own, given what the inputs say of them, z [K, n]."""
-        prior, own = self._own, self._own
+        """Moves what is the items' own, given what the inputs say of them, z [n]."""
+        prior, own, bend = self._own, self._own, self._known
         for _ in range(STEPS):
-            p = (z + own.gather(1, items)).sigmoid()
-            slope = self._known * (own - prior)
-            slope = slope.scatter_add(1, items, p - labels)
-            bend = self._known.scatter_add(1, items, (p * (1 - p)).clamp(min=SURE))
+            p = (z + own[items]).sigmoid()
+            slope = (self._known * (own - prior)).scatter_add(0, items, p - labels)
+            bend = self._known.scatter_add(0, items, (p * (1 - p)).clamp(min=SURE))
             step = (slope / bend).clamp(-LEAP, LEAP)
             own = own - step
             if float(step.abs().max()) < CLOSE:
@@ -172,7 +155,7 @@ class Belief:
         self._own, self._known = own, bend
 
     def _columns(self, inputs: Tensor) -> Tensor:
-        """Returns the columns of inputs [K, n, D]: [K, n, F]."""
+        """Returns the columns of inputs [n, D]: [n, F]."""
         x = inputs if self._project is None else inputs @ self._project
         waves = self._height * (x @ self._frequencies + self._phases).cos()
         one = torch.ones_like(waves[..., :1])
@@ -181,7 +164,3 @@ class Belief:
 
 def _curvature(phi: Tensor, p: Tensor) -> Tensor:
     return phi.mT @ (phi * (p * (1 - p)).clamp(min=SURE).unsqueeze(-1))
-
-
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
