@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from proposer_rl.curricula.adaptive import AdaptiveMixture as AdaptiveMixture
 from proposer_rl.curricula.batches import SomeBins as SomeBins
 from proposer_rl.curricula.batches import level_keys as level_keys
 from proposer_rl.curricula.bins import BinCurriculum as BinCurriculum
