@@ -255,5 +255,5 @@ def test_shares_of_batches_are_curves_over_updates(tmp_path: Path) -> None:
     series = found["share of the batch: way"].axes[UPDATES](study.groups[0])
     assert found.keys() == {"share of the batch: way", "share of the batch: rest"}
     assert all(one.rate for one in found.values())
-    assert series.columns.tolist() == [0, 10, 20]
-    np.testing.assert_allclose(series.to_numpy(), [[0.3, np.nan, 0.5]])
+    assert series is not None and series.columns.tolist() == [0, 10, 20]
+    np.testing.assert_allclose(series.to_numpy()[0], [0.3, np.nan, 0.5])
