@@ -37,7 +37,7 @@ from proposer_rl.models import (
     ProposerNetwork,
     UNet,
 )
-from proposer_rl.recipes import Recipe, filter_content, override, recipe_function
+from proposer_rl.recipes import DEFAULT_METHOD, Recipe, filter_content, override, recipe_function
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 __all__ = [
+    "DEFAULT_METHOD",
     "PPO",
     "ActorCritic",
     "ActorStudent",
@@ -171,7 +172,7 @@ class Run:
 
 def train(
     task: Recipe | str,
-    curriculum: Recipe | str,
+    curriculum: Recipe | str = DEFAULT_METHOD,
     *,
     scale: str | None = None,
     filter: Mapping[str, Any] | str | None = None,
@@ -188,7 +189,8 @@ def train(
 
     Args:
         task: ``prl.tasks.NAME(...)``, or the name alone.
-        curriculum: ``prl.curricula.NAME(...)``, or the name alone.
+        curriculum: ``prl.curricula.NAME(...)``, or the name alone; without one
+            ``prl.DEFAULT_METHOD``.
         scale: how much is computed, for tasks that have scales: ``"smoke"``, ``"quick"``,
             ``"medium"`` or ``"paper"``; None for the task's own numbers.
         filter: of the proposed levels: ``"learnability"`` or another name in ``conf/filter``, or

@@ -22,6 +22,7 @@ PACKAGE = Path(__file__).resolve().parent
 CONFIG_FOLDER = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"
 KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*([ -][A-Za-z_][A-Za-z0-9_]*)*")  # what Hydra takes
 CONSTANTS = {"null", "true", "false", "nan", "inf"}
+DEFAULT_METHOD = "adaptive_mixture"  # for those who do not want to choose
 MISSING = "???"  # in a file: to be given
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")  # in a file: to another setting
 KEYS = {"task": ("task",), "method": ("curriculum", "model")}

@@ -127,6 +127,14 @@ def test_a_run_in_a_maze_is_that_of_the_command_line(
     assert open_session(run.folder).about()["board"] is not None
 
 
+def test_a_curriculum_need_not_be_chosen(tmp_path: Path) -> None:
+    run = prl.train("maze", updates=3, folder=tmp_path / "run", **SMOKE)
+    config = json.loads((run.folder / "config.json").read_text())
+    assert config["method"] == prl.DEFAULT_METHOD in dir(prl.curricula)
+    space = prl.Parameters({"gravity": (5.0, 25.0)})  # a space is enough, too
+    assert 5 <= prl.Teacher(prl.DEFAULT_METHOD, space).ask()[1]["gravity"] <= 25
+
+
 def test_a_run_on_gymnasium_goes_on_in_its_folder(tmp_path: Path) -> None:
     def train(updates: int, folder: str, **annealed: Any) -> prl.Run:
         task = prl.tasks.from_gymnasium("CartPole-v1", **CARTPOLE)

@@ -34,10 +34,12 @@ def test_rows_and_settings_go_to_tensorboard(tmp_path: Path) -> None:
         log = log_of(write, lambda: None)
         log("metrics", {"id_success": 0.25, "frames": 100}, 10)
         log("metrics", {"id_success": 0.5, "frames": 200}, 20)
+        log("cycles", {"shares": {"way": [0.25, 0.75]}}, 20)
     (folder,) = {file.parent for file in tmp_path.rglob("events.out.*")}
     events = EventAccumulator(str(folder)).Reload()
     found = [(event.step, event.value) for event in events.Scalars("metrics/id_success")]
     assert found == [(10, 0.25), (20, 0.5)]
+    assert [event.value for event in events.Scalars("cycles/shares/way")] == [0.5]
     (event,) = events.Tensors("config/solver/text_summary")
     assert event.tensor_proto.string_val == [b"{'ppo': {'gamma': 0.9}}"]
 

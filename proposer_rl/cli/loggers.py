@@ -18,7 +18,7 @@ from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.experiment import Log
 from proposer_rl.extras import install_command
 from proposer_rl.runs.folder import write_atomically
-from proposer_rl.runs.records import numbers, picture
+from proposer_rl.runs.records import batch_shares, numbers, picture
 
 COLUMNS, GAP = 4, 8  # of a sheet of pictures; white pixels between them
 ID = "wandb_id.txt"
@@ -143,13 +143,15 @@ def _refusal(error: Exception) -> ConfigError:
 
 
 def _numbers(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    """A row's numbers, of a list of them the maximum and the mean."""
+    """A row's numbers, of a list of them the maximum and the mean, and its shares of a batch."""
     for key, value in row.items():
         if isinstance(value, int | float):
             yield key, value
         elif (found := numbers(value)) is not None:
             yield f"{key}_max", float(found.max())
             yield f"{key}_mean", float(found.mean())
+    for name, share in batch_shares(row).items():
+        yield f"shares/{name}", share
 
 
 def _images(

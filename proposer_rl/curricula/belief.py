@@ -12,8 +12,8 @@ to the maximum of their posterior, by Newton's method, with the curvature there 
 updating of conditional probabilities on directed graphical structures", Networks 20). Its cost is
 linear in the levels of the batch, and nothing is kept of earlier ones.
 
-The student moves. At every batch, with lambda = 2 ** (-1 / half_life), what was known fades towards the
-prior, precision P and P beta alike:
+The student moves. At every batch, with lambda = 2 ** (-1 / half_life), what was known fades towards
+the prior, precision P and P beta alike:
 
     P <- lambda P + (1 - lambda) P_0,      P beta <- lambda P beta,
 
@@ -122,7 +122,12 @@ class Belief:
             self._observe_items(items, z, labels)
 
     def predict(self, inputs: Tensor, items: Tensor | None = None) -> Tensor:
-        """Returns the probability of success on levels, as :meth:`observe` has them: float64 [n]."""
+        """Returns the probability of success on levels, float64 [n].
+
+        Args:
+            inputs: as of :meth:`observe`.
+            items: likewise.
+        """
         if self._covariance is None:
             self._covariance = torch.linalg.inv(self._precision)
         phi = self._columns(inputs)

@@ -19,6 +19,7 @@ from proposer_rl.runs.records import (
     PLACE,
     Column,
     Record,
+    batch_shares,
     number,
     numbers,
     words,
@@ -123,13 +124,15 @@ def gains(study: Study) -> list[Measure]:
 
 
 def own_numbers(study: Study) -> list[Measure]:
-    """Whatever numbers the curricula recorded in cycles that are not drawn elsewhere."""
+    """Shares of batches, and whatever numbers of cycles are not drawn elsewhere."""
     cycles = [cycle for group in study.groups for run in group.logs for cycle in run.cycles]
     found = {name for c in cycles for name, value in c.items() if not math.isnan(number(value))}
     names = {n for n in found - PLACE - GAINS.keys() if n.isprintable() and len(n) <= LONGEST_TEXT}
     texts = {name: text for name, text in OWN.items() if name in names}
     texts |= {name: name.replace("_", " ") for name in sorted(names - texts.keys())}
-    own = [
+    arms = list(dict.fromkeys(name for cycle in cycles for name in batch_shares(cycle)))[:MOST]
+    own = [_of_cycles(f"share of the batch: {n}", partial(_share, name=n), rate=True) for n in arms]
+    own += [
         _of_cycles(text, partial(_value, name=name)) for name, text in list(texts.items())[:MOST]
     ]
     if any(map(recorded_gain, study.groups)):
@@ -236,8 +239,8 @@ def of_gains(cycle: Record, names: Iterable[str], reduce: Callable[[Column], flo
     return float(reduce(found[0])) if found else np.nan
 
 
-def _of_cycles(name: str, value: Value) -> Measure:
-    return Measure(RECORDED, name, {UPDATES: partial(over_cycles, value=value)})
+def _of_cycles(name: str, value: Value, *, rate: bool = False) -> Measure:
+    return Measure(RECORDED, name, {UPDATES: partial(over_cycles, value=value)}, rate)
 
 
 def _worst_series(group: Group, study: Study, name: str) -> Series | None:
@@ -250,6 +253,10 @@ def _worst_series(group: Group, study: Study, name: str) -> Series | None:
 
 def _value(cycle: Record, name: str) -> float:
     return number(cycle.get(name))
+
+
+def _share(cycle: Record, name: str) -> float:
+    return batch_shares(cycle).get(name, math.nan)
 
 
 def _ratio(values: Column) -> float:

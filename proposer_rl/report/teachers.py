@@ -18,7 +18,7 @@ from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.runs import LARGEST_FILE
 from proposer_rl.report.style import Drawing, Look, finish, looks, render, style
 from proposer_rl.runs.folder import read_jsonl, write_atomically
-from proposer_rl.runs.records import LARGEST, Column, printable
+from proposer_rl.runs.records import LARGEST, Column, batch_shares, printable
 
 PAGE = "teachers.html"
 COMMON = ("mean_return", "mean_success", "proposed", "told", "dropped", "out")
@@ -84,9 +84,10 @@ def read_log(file: Path) -> Log:
     try:
         if file.stat().st_size > LARGEST_FILE:
             raise ValueError(f"is larger than {LARGEST_FILE:,} bytes")
-        rows: Sequence[Mapping[str, Any]] = read_jsonl(file)
+        rows: Sequence[dict[str, Any]] = read_jsonl(file)
         if not rows or not all("told" in row and "drawn" in row for row in rows):
             raise ValueError("is no log of a teacher, as teacher.log(file) writes it")
+        rows = [row | {f"share: {n}": s for n, s in batch_shares(row).items()} for row in rows]
         names = dict.fromkeys([*COMMON, *(name for row in rows for name in row)])
         entries = {
             name: np.array([_mean(row.get(name)) for row in rows])

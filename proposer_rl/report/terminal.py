@@ -27,6 +27,7 @@ from proposer_rl.runs.records import (
     LONGEST_TEXT,
     PLACE,
     Column,
+    batch_shares,
     number,
     numbers,
     printable,
@@ -234,7 +235,7 @@ def _curves(runs: Sequence[Run]) -> RenderableType:
 
 
 def _cycles(run: Run) -> list[RenderableType]:
-    """The gains of the replicas or else the curriculum's numbers, and its proposals."""
+    """The gains of the replicas or else the curriculum's numbers, its shares and proposals."""
     cycle, grid = run.cycles[-1], Table.grid(padding=(0, 1))
     for name, text in GAINS.items():
         gains = [found for c in run.cycles if (found := numbers(c.get(name))) is not None]
@@ -248,8 +249,12 @@ def _cycles(run: Run) -> list[RenderableType]:
         if values:
             drawn = sparkline(_some(values), min(values), max(values))
             grid.add_row(Text(words(name)), Text(drawn), f"{values[-1]:.4g}")
+    parts: list[RenderableType] = [grid]
+    if batch := batch_shares(cycle):
+        told = ", ".join(f"{name} {share:.0%}" for name, share in batch.items())
+        parts.append(Text(f"of the batch: {told[:LONGEST_TEXT]}"))
     shares = run.shares(cycle)
-    return [grid] if shares is None else [grid, *_map(run, share_map(shares))]
+    return parts if shares is None else [*parts, *_map(run, share_map(shares))]
 
 
 def _map(run: Run, shares: Column) -> list[RenderableType]:

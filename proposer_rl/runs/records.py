@@ -188,6 +188,16 @@ def numbers(value: Any) -> Column | None:
     return found if np.isfinite(found).all() else None
 
 
+def batch_shares(record: Record) -> dict[str, float]:
+    """Returns the parts of batches that a curriculum's ``shares`` tell, by their names.
+
+    Of several students the mean; empty where a record has none.
+    """
+    told = record.get("shares")
+    means = {name: number(own) for name, own in told.items()} if isinstance(told, Mapping) else {}
+    return {printable(name)[:80]: mean for name, mean in means.items() if not math.isnan(mean)}
+
+
 def words(name: str) -> str:
     """A column in words: ``id_success`` is ID success."""
     first, _, rest = name.partition("_")

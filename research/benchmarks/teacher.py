@@ -68,9 +68,9 @@ def adaptive_mixture(options: Options) -> list[Row]:
         ways[name] = partial(_one_by_one, Teacher(curricula.adaptive_mixture(), space), count)
         per[name], targets[name] = count, OF_A_PAIR
     known = torch.rand(items, FEATURES, generator=torch.Generator().manual_seed(0))
-    space = Items(items, features=known, target=range(items // 100))
+    prompts = Items(items, features=known, target=range(items // 100))
     name = f"a step of {count} of {items:,} items with {FEATURES} features"
-    ways[name] = partial(_batch, Teacher(curricula.adaptive_mixture(), space), count)
+    ways[name] = partial(_batch, Teacher(curricula.adaptive_mixture(), prompts), count)
     per[name], targets[name] = 1, OF_AN_ITEM * items
     for way in ways.values():
         way()

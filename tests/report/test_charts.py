@@ -18,6 +18,7 @@ from proposer_rl.report import build, page
 from proposer_rl.report.build import write_report
 from proposer_rl.report.charts import charts
 from proposer_rl.report.figures import learning_curves
+from proposer_rl.report.measures import own_numbers
 from proposer_rl.report.studies import read_studies
 from proposer_rl.report.style import render
 from tests.report.folders import TASK, cycle, page_data, png, write_jsonl, write_run
@@ -242,3 +243,17 @@ def test_pictures_that_are_too_large_are_fewer_or_none(tmp_path: Path) -> None:
         (data,) = page_data(write_report([folder], tmp_path / f"o{count}", progress=False))
         shown = data["stages"] and data["stages"]["methods"][0]["stages"]
         assert (shown and len(shown)) == expected
+
+
+def test_shares_of_batches_are_curves_over_updates(tmp_path: Path) -> None:
+    """Of each name; where a cycle tells none there is a gap."""
+    told = [{"way": [0.2, 0.4], "rest": 0.7}, {"rest": [1.0]}, {"way": 0.5, "rest": [0.5]}]
+    cycles = [{"updates": 10 * i, "shares": shares} for i, shares in enumerate(told)]
+    write_run(tmp_path / "run", cycles=cycles)
+    (study,), _ = read_studies([tmp_path / "run"], None)
+    found = {one.name: one for one in own_numbers(study)}
+    series = found["share of the batch: way"].axes[UPDATES](study.groups[0])
+    assert found.keys() == {"share of the batch: way", "share of the batch: rest"}
+    assert all(one.rate for one in found.values())
+    assert series is not None and series.columns.tolist() == [0, 10, 20]
+    np.testing.assert_allclose(series.to_numpy()[0], [0.3, np.nan, 0.5])

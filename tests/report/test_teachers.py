@@ -47,6 +47,13 @@ def test_a_page_has_the_entries_of_all_logs_and_what_was_drawn(
     assert page.count("data:image/png") == 3 and not re.search("<[ib]>", page)
 
 
+def test_shares_of_batches_are_entries_by_name(tmp_path: Path) -> None:
+    rows = [{"told": 4, "drawn": {}, "shares": shares} for shares in ({"way": [0.2, 0.4]}, None)]
+    (tmp_path / "x.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    found = read_log(tmp_path / "x.jsonl").entries
+    np.testing.assert_allclose(found["share: way"], [0.3, np.nan])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -41,6 +41,16 @@ def test_one_run_is_a_screen(tmp_path: Path, capsys) -> None:
     assert "S • • G" in text  # the path of the level that was recorded
 
 
+def test_shares_of_a_batch_are_a_line(tmp_path: Path, capsys) -> None:
+    """Of the last cycle, the means of the students; what is no share is left out."""
+    shares = {"near [target]": [0.25, 0.75], "\x1b[2J": 0.5, "broken": ["x"], "none": {}}
+    cycles = [{"updates": at, "shares": told} for at, told in ((0, {"near": 1}), (10, shares))]
+    write_run(tmp_path / "a", cycles=cycles)
+    assert "of the batch: near [target] 50%, ?[2J 50% " in watch(capsys, str(tmp_path / "a"))
+    write_run(tmp_path / "b", cycles=[{"updates": 0, "shares": [0.5, 0.5]}])
+    assert "of the batch" not in watch(capsys, str(tmp_path / "b"))
+
+
 def test_seeds_of_which_one_is_a_row_ahead_are_drawn(tmp_path: Path, capsys) -> None:
     folder = write_run(tmp_path / "run", seeds=[0, 1], finished=False)
     table = folder / "metrics.csv"

@@ -18,7 +18,7 @@ class IceEnv(BatchedEnv):
     """A walk along a strip of ``width`` cells, ``length`` of them, with pits on both sides.
 
     Instead of an action one slips to the left or to the right with the probability ``slip``. The
-    end is worth 1 and a pit slightly less than nothing, which is what is left when time is over.
+    end pays 1 and a pit slightly less than nothing, which is what is left when time is over.
     """
 
     state_size: ClassVar[int] = 2

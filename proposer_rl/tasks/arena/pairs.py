@@ -1,4 +1,4 @@
-"""Two hundred goals in the plane that were drawn once, and are told apart by features."""
+"""Two hundred goals in the plane that were drawn once, and differ in features."""
 
 from __future__ import annotations
 

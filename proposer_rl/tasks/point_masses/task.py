@@ -51,6 +51,7 @@ class PointMassEnv(BatchedEnv):
       episode ends with the time limit and less than 0.25 from the goal.
 
     Example:
+        >>> from tensordict import TensorDict
         >>> level = {"position": torch.zeros(1), "width": torch.ones(1), "friction": torch.zeros(1)}
         >>> env = PointMassEnv(TensorDict(level, [1]))
         >>> down = env.reset().set("action", torch.tensor([[0.0, -1.0]]))
