@@ -25,8 +25,8 @@ READERS = ("report", "cli.watch", "cli.report")
 SHOWING = ("report", "play")
 SHOW = {"cli.report", "cli.watch", "cli.play", "cli.evaluate", "cli.shown"}
 TRAINING = ("cli.run", "cli.build", "methods", "experiment.loop", "teaching")
-# The names of the package itself, and the room that knows mazes.
-KNOW_MAZES = ("tasks.mazes", "tasks.view_mazes", "api")
+# The names of the package itself, the rooms that know mazes, and an environment with its own walls.
+KNOW_MAZES = ("tasks.mazes", "tasks.view_mazes", "tasks.arena.goal_maze", "api")
 MOST_ROOMS = 17
 
 
