@@ -112,9 +112,9 @@ def test_every_method_task_and_command_is_called() -> None:
     called = [words for extra in NAMED for words in minimal.commands(extra, available("method"))]
     words = {word for command in called for word in command}
     assert {f"+method={method}" for method in available("method")} <= words
-    # Of view mazes the smallest; task=gymnasium is what the others are made of; task=maze is given.
+    # Of view mazes the smallest; gymnasium and batched are what others are made of; maze is given.
     tasks = set(available("task"))
-    tasks -= {"maze", "gymnasium", "view_maze", "view_maze_quick"}
+    tasks -= {"maze", "gymnasium", "batched", "view_maze", "view_maze_quick"}
     assert {f"task={task}" for task in tasks} <= words
     assert {f"proposer-{name}" for name, *_ in called} == PROJECT["scripts"].keys()
 

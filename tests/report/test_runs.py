@@ -171,8 +171,8 @@ def in_cycle(value: object):
         ("run.json", set_key("task", "space", value={"a": [0] * 257}), "at most 256 items"),
         (
             "run.json",
-            set_key("task", "space", value={key: [0] for key in "abcdefghi"}),
-            "at most 8 items",
+            set_key("task", "space", value={key: [0] for key in "abcdefghijklmnopq"}),
+            "at most 16 items",
         ),
         ("run.json", set_key("task", "about", value={"a": "b\nc"}), "about.a: Value error"),
         ("run.json", set_key("task", "samples", value={"id": [1]}), "samples.id.0: Input"),
