@@ -7,7 +7,7 @@ the success on the target lately, their shares are
     t = low + (HIGH - low) b / (b + HALF),      w = (1 - t) q,      u = (1 - t) (1 - q).
 
 The target gets more the more often it is solved: there training pays most. While it is never
-solved, ``low`` lies between FLOOR, where all of its episodes return the same and so teach nothing,
+solved, ``low`` lies between FLOOR, where its episodes alone all return the same and teach nothing,
 and LOW, where they differ at least half as much as all episodes do. Of what is left the way gets a
 part q that grows with the skill of the belief, 1 - its squared errors on uniform levels over those
 of their mean. Uniform sampling is never given up, as beliefs may be wrong; with little skill it
@@ -25,6 +25,7 @@ Transport" (ICML), with particles in place of bins, and no pace but what is mast
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any
@@ -64,6 +65,7 @@ NEAR = 0.025  # standard deviation of what is added between two levels, in share
 AT_ONCE = 64  # levels of the way that are assigned to draws of the target together
 FORBIDDEN = 1e3  # cost of a candidate that is not mastered
 FAILURES = 4.0  # on the target, that are taken for seen at the beginning
+LOGGED = 100  # batches at most, whose predictions a log is about
 SHOWN = 6  # levels of each arm that a reader is shown
 EQUAL = 1e-9  # returns that differ no more than this are equal, in units of the largest
 
@@ -110,7 +112,8 @@ class AdaptiveMixture(Curriculum):
         self._range = torch.zeros(2, 0, dtype=torch.float64)  # lowest and highest return
         self._told = False  # whether success is told
         self._last: dict[str, Levels] = {}  # on the way, of each student [m]
-        self._seen: list[tuple[Tensor, Tensor]] = []  # what was predicted, and its label [K, m]
+        # What was predicted, and what it was [K, m]; loops may go on for ever without a log.
+        self._seen: deque[tuple[Tensor, Tensor]] = deque(maxlen=LOGGED)
         self._shown: dict[str, Any] = {}
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
@@ -146,9 +149,9 @@ class AdaptiveMixture(Curriculum):
         """
         shown, self._shown = self._shown, {}
         if self._seen:
-            predicted, label = (torch.cat(one, 1) for one in zip(*self._seen, strict=True))
-            shown |= calibration(predicted, label)
-            self._seen = []
+            predicted, success = (torch.cat(one, 1) for one in zip(*self._seen, strict=True))
+            shown |= calibration(predicted, success)
+            self._seen.clear()
         return shown
 
     def state_dict(self) -> dict[str, Any]:
@@ -191,7 +194,7 @@ class AdaptiveMixture(Curriculum):
             for belief, x, label, own in every:
                 belief.grow_older(batches)
                 belief.observe(x, label, own)
-            self._seen.append((seen["predicted"], labels))
+            self._seen.append((seen["predicted"], success))
             of = {
                 "levels": torch.ones_like(labels),
                 "successes": success,

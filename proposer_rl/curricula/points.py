@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import torch
 from annotated_types import Interval
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.settings import ArgumentError
@@ -80,6 +81,17 @@ class Points:
             if name not in names:
                 raise ArgumentError(f"start.{name}: unknown; there are: {', '.join(names)}")
         return torch.tensor([(start or {}).get(name, 0.0) for name in names], dtype=torch.float64)
+
+
+def measured(outcome: TensorDictBase, measure: str) -> Tensor:
+    """Returns success or return of an outcome [K, n], whichever is the measure: float64 [K, n].
+
+    Raises:
+        ValueError: if the outcome has no success and success is the measure.
+    """
+    if measure not in outcome.keys():
+        raise ValueError(f"measure={measure}: the outcome has no success")
+    return outcome[measure].double()
 
 
 def nearest(points: Tensor, places: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.points import Place, Points
+from proposer_rl.curricula.points import Place, Points, measured
 from proposer_rl.curricula.student import Student
 from proposer_rl.curricula.transport import shares_of_bins
 from proposer_rl.settings import ArgumentError, Count, Positive, checked
@@ -130,10 +130,8 @@ class SelfPacedCurriculum(Curriculum):
             ValueError: if the outcome has no success and success is the measure.
         """
         self._inbox.check(batch, outcome)
-        if self._measure not in outcome.keys():
-            raise ValueError(f"measure={self._measure}: the outcome has no success")
+        reached = measured(outcome, self._measure)
         self._counts += counts_of_bins(batch.notes["bins"], self.space)
-        reached = outcome[self._measure].double()
         self._inbox.put(batch, **batch.notes.select("points", "log_density"), reached=reached)
 
     def log(self) -> dict[str, Any]:

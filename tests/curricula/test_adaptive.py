@@ -24,6 +24,7 @@ from proposer_rl.curricula import AdaptiveMixture, Batch, Curriculum, SamplingCu
 from proposer_rl.curricula.adaptive import (
     FLOOR,
     HIGH,
+    LOGGED,
     LOW,
     TARGET,
     UNIFORM,
@@ -426,3 +427,19 @@ def test_where_skill_grows_at_its_frontier_it_beats_uniform_levels_and_the_targe
 def test_where_the_target_alone_teaches_it_is_nearly_as_fast() -> None:
     adaptive, uniform, target = compared(True, 0.9, 120)
     assert adaptive < 2 * target < uniform, (adaptive, uniform, target)
+
+
+def test_the_brier_score_is_of_success_also_where_the_belief_learns_from_returns() -> None:
+    curriculum = AdaptiveMixture(LINE, LINE.target)
+    seen = teach(curriculum, below(-1.0), updates=12)  # returns differ, nobody succeeds
+    _, log = following(curriculum)
+    predicted = torch.cat([batch.notes["predicted"] for batch, _ in seen], 1)
+    assert log["brier"] == [pytest.approx(float(predicted.square().mean()))]
+    assert log["brier_constant"] == [0.0]
+
+
+def test_what_nobody_logs_does_not_pile_up() -> None:
+    curriculum = AdaptiveMixture(LINE, LINE.target)
+    teach(curriculum, below(0.5), updates=LOGGED + 20, count=4)
+    _, log = following(curriculum, 4)
+    assert sum(log["reliability"]["levels"][0]) == 4 * LOGGED
