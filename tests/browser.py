@@ -14,23 +14,26 @@ OPTIONS = [
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
 ]
+LONGEST = 300_000.0  # milliseconds: what takes longer never comes, and a run must not wait for ever
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on the PATH")
 
 
 @contextmanager
 def chromium() -> Iterator[Any]:
-    """The browser, as Playwright drives it; on a machine that is busy nothing comes too late."""
+    """The browser, as Playwright drives it, with time enough for a machine that is busy."""
     from playwright.sync_api import expect, sync_playwright
 
-    expect.set_options(timeout=0)
+    expect.set_options(timeout=LONGEST)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS, timeout=0)
+        browser = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=OPTIONS, timeout=LONGEST
+        )
         yield browser
         browser.close()
 
 
 def new_context(browser: Any, **options: Any) -> Any:
-    """A context of the browser that waits as long as it takes."""
+    """A context of the browser that waits as long as the browser does."""
     context = browser.new_context(**options)
-    context.set_default_timeout(0)
+    context.set_default_timeout(LONGEST)
     return context
