@@ -69,6 +69,7 @@ FORBIDDEN = 1e3  # cost of a candidate that is not mastered
 FAILURES = 4.0  # on the target, that are taken for seen at the beginning
 LOGGED = 100  # batches at most, whose predictions a log is about
 SHOWN = 6  # levels of each arm that a reader is shown
+OUTLIERS, MOST_OUTLIERS = 1000, 63  # one in so many returns at either end; and at most
 EQUAL = 1e-9  # returns that differ no more than this are equal, in units of the largest
 
 
@@ -76,8 +77,9 @@ class AdaptiveMixture(Curriculum):
     """Mixes the target, uniform sampling and a way between them by what was seen of each.
 
     See the module for the equations. Labels are successes where they are told; else returns, as
-    shares of the range from the lowest to the highest that was seen. It asks nothing of a student,
-    so that it costs no frames and no oracle.
+    shares of the range from the lowest to the highest that was seen, less one in a thousand at
+    either end, so that an episode that went wrong does not make all others look alike. It asks
+    nothing of a student, so that it costs no frames and no oracle.
 
     Args:
         space: where levels come from. ``between(a, b, noise, generator)`` gives levels on the way,
@@ -91,7 +93,7 @@ class AdaptiveMixture(Curriculum):
         times: candidates for each level of the way.
     """
 
-    remembers = ("_inbox", "_sums", "_best", "_range", "_told")
+    remembers = ("_inbox", "_sums", "_best", "_ends", "_number", "_told")
 
     @checked
     def __init__(
@@ -111,7 +113,8 @@ class AdaptiveMixture(Curriculum):
         self._beliefs: list[Belief] = []  # of each student
         self._sums = torch.zeros(0, len(ARMS), len(SUMS), dtype=torch.float64)
         self._best = torch.zeros(0, dtype=torch.float64)  # success on the target, b
-        self._range = torch.zeros(2, 0, dtype=torch.float64)  # lowest and highest return
+        # The lowest returns and the negatives of the highest [2, K, m], of how many levels.
+        self._ends, self._number = torch.zeros(2, 0, 0, dtype=torch.float64), 0
         self._told = False  # whether success is told
         self._last: dict[str, Levels] = {}  # on the way, of each student [m]
         # What was predicted, and what it was [K, m]; loops may go on for ever without a log.
@@ -186,8 +189,7 @@ class AdaptiveMixture(Curriculum):
         self._beliefs = list(made)
         self._sums = self._sums.new_zeros(students, *self._sums.shape[1:])
         self._best = self._best.new_zeros(students)
-        ends = torch.tensor([[torch.inf], [-torch.inf]], dtype=torch.float64)
-        self._range = ends.expand(2, students)
+        self._ends = self._ends.new_zeros(2, students, 0)
 
     def _take_in(self) -> None:
         """Learns from the outcomes since the last proposal."""
@@ -219,12 +221,13 @@ class AdaptiveMixture(Curriculum):
 
     def _labels(self, returns: Tensor, success: Tensor | None) -> tuple[Tensor, Tensor]:
         """Returns what counts as success on levels, and what the belief learns, float64 [K, m]."""
-        extremes = torch.stack([returns.amin(1), -returns.amax(1)])
-        sign = torch.tensor([[1.0], [-1.0]], dtype=torch.float64)
-        self._range = sign * torch.minimum(sign * self._range, extremes)
-        low, high = self._range.unsqueeze(-1)
+        self._number += returns.shape[1]
+        ends = torch.cat([self._ends, torch.stack([returns, -returns])], -1).sort(-1).values
+        self._ends = ends[..., : MOST_OUTLIERS + 1]
+        place = min(self._number // OUTLIERS, MOST_OUTLIERS)
+        low, high = ends[0, :, place, None], -ends[1, :, place, None]
         wide = high - low > EQUAL * torch.maximum(high.abs(), low.abs())
-        grades = torch.where(wide, (returns - low) / (high - low), 0.5)
+        grades = torch.where(wide, (returns - low) / (high - low), 0.5).clamp(0, 1)
         self._told = self._told or success is not None
         if success is None:
             return grades, grades
