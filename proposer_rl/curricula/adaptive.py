@@ -138,6 +138,8 @@ class AdaptiveMixture(Curriculum):
             for name in ("return", "success")
             if name in outcome.keys()
         }
+        if "episodes" in outcome.keys() and "rollout" not in outcome.keys():
+            results["counts"] = outcome["episodes"].double().cpu()  # that the means are of
         self._inbox.put(batch, **batch.notes.exclude("number", "place", "size"), **results)
 
     def log(self) -> dict[str, Any]:
@@ -176,7 +178,11 @@ class AdaptiveMixture(Curriculum):
         one = self._space.sample(1, torch.Generator())
         items = 0 if self._items(one) is None else self._space.size
         width = self._inputs(one).shape[-1]
-        made = (Belief(width, items, half_life=self._half_life) for _ in range(students))
+        expected = getattr(self._space, "expected", None)
+        made = (
+            Belief(width, items, expected=expected, half_life=self._half_life)
+            for _ in range(students)
+        )
         self._beliefs = list(made)
         self._sums = self._sums.new_zeros(students, *self._sums.shape[1:])
         self._best = self._best.new_zeros(students)
@@ -189,11 +195,11 @@ class AdaptiveMixture(Curriculum):
             returns = seen["return"]
             success, labels = self._labels(returns, seen.get("success", None))
             batches = labels.shape[1] / max(int(seen["size"][0, 0]), FEW)  # that have passed
-            which = _each(seen.get("items", None), len(labels))
-            every = zip(self._beliefs, seen["inputs"], labels, which, strict=True)
-            for belief, x, label, own in every:
+            which, counts = (_each(seen.get(n, None), len(labels)) for n in ("items", "counts"))
+            every = zip(self._beliefs, seen["inputs"], labels, which, counts, strict=True)
+            for belief, x, label, own, count in every:
                 belief.grow_older(batches)
-                belief.observe(x, label, own)
+                belief.observe(x, label, own, count)
             self._seen.append((seen["predicted"], success))
             of = {
                 "levels": torch.ones_like(labels),
@@ -278,7 +284,9 @@ class AdaptiveMixture(Curriculum):
         targets = goal.sample(count, draw)
         levels = self._candidates(k, self._times * count, targets, draw)
         goals, x, items = self._inputs(targets), self._inputs(levels), self._items(levels)
-        p = self._beliefs[k].predict(x, items)
+        belief = self._beliefs[k]
+        # What comes back is explored by draws, which differ where little or nothing new is known.
+        p = belief.predict(x) if items is None else belief.draw(x, items, draw)
         allowed = p >= p.topk(count).values[-1].clamp(max=self._delta)
         extra = torch.where(allowed, -LEARNABLE * 4 * p * (1 - p), FORBIDDEN)
         chosen = []
