@@ -23,6 +23,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.outcome_model import calibration
+from proposer_rl.curricula.scores import mixed
 from proposer_rl.curricula.student import Student
 from proposer_rl.meta.actions import systematic_draw
 from proposer_rl.settings import ArgumentError, Decay, Positive, Share, checked
@@ -244,9 +245,7 @@ class CategoryBandit(ItemCurriculum):
     """
 
     @checked
-    def __init__(
-        self, space: Space, *, rate: Share = 0.5, temperature: Positive = 0.4
-    ) -> None:
+    def __init__(self, space: Space, *, rate: Share = 0.5, temperature: Positive = 0.4) -> None:
         super().__init__(space)
         categories: Tensor | None = getattr(space, "categories", None)
         if categories is None:
@@ -391,20 +390,6 @@ def nearest(
     places = mixed_up[keys.argsort(stable=True)[:rest]]
     places = torch.cat([*([mixed_up] * rounds), places])
     return places[torch.randperm(count, generator=generator)]
-
-
-def mixed(p: Tensor, answers: Tensor | float) -> Tensor:
-    """Returns the probability that not all answers to an item are alike.
-
-    Args:
-        p: probability of a right one.
-        answers: number G of them.
-
-    Example:
-        >>> mixed(torch.tensor([0.0, 0.5, 0.9]), 2.0)
-        tensor([0.0000, 0.5000, 0.1800])
-    """
-    return 1 - p**answers - (1 - p) ** answers
 
 
 def arc_length(right: Tensor, answers: Tensor) -> tuple[Tensor, Tensor]:
