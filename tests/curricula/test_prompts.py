@@ -66,7 +66,7 @@ def test_mopps_has_the_beta_distributions_of_its_paper() -> None:
 
 
 def test_adarft_follows_success_with_a_difficulty() -> None:
-    curriculum = made(prl.curricula.adarft(step=0.4, sensitivity=2.0, target=0.5))
+    curriculum = made(prl.curricula.adarft(step=0.4, sensitivity=2.0, aim=0.5))
     assert set(proposed(curriculum, 2)) == {0, 1}
     difficulty = 0.1
     for number, won in enumerate((8, 8, 2, 8, 8)):

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 
 import proposer_rl as prl
 
-FAMILIES, EACH, PROMPTS, ANSWERS = 4, 20, 16, 8
+FAMILIES, EACH, PROMPTS, ANSWERS = 4, 60, 16, 8
 FAULT, END = 30, 80  # batches
 FASTER = 0.035
 
@@ -55,7 +55,7 @@ def passes(recipe: Any, seed: int) -> float:
         items = teacher.propose(PROMPTS)
         success = torch.bernoulli(p[items].expand(ANSWERS, -1), generator=draw).mean(0)
         gains = (success * (1 - success)).sqrt()
-        skill = skill.index_add(0, family[items], FASTER * gains) + FASTER * gains.sum() / 20
+        skill = skill.index_add(0, family[items], FASTER * gains)
         number = torch.full_like(success, ANSWERS)
         teacher.observe({"return": success, "success": success, "episodes": number})
     return float((skill[0] - difficulty)[family == 0].sigmoid().mean())
@@ -73,4 +73,4 @@ def test_the_default_method_comes_back_to_a_family_that_had_a_fault(uniform: flo
 def test_who_believes_what_it_saw_starves_it(uniform: float) -> None:
     """So that the test above can fail."""
     greedy = prl.curricula.own(Greedy)
-    assert sum(passes(greedy, seed) for seed in range(2)) / 2 < 0.8 * uniform
+    assert sum(passes(greedy, seed) for seed in range(2)) / 2 < 0.9 * uniform
