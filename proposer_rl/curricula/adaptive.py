@@ -290,8 +290,10 @@ class AdaptiveMixture(Curriculum):
         goals, x, items = self._inputs(targets), self._inputs(levels), self._items(levels)
         belief = self._beliefs[k]
         # Items are explored by draws, which differ where little is known, or nothing new.
-        explores = self._is_data and items is not None
-        p = belief.draw(x, items, draw) if explores else belief.predict(x, items)
+        if items is None or not self._is_data:
+            p = belief.predict(x, items)
+        else:
+            p = belief.draw(x, items, draw)
         allowed = p >= p.topk(count).values[-1].clamp(max=self._delta)
         bonus = ITEMS_LEARNABLE if self._is_data else LEARNABLE
         extra = torch.where(allowed, -bonus * 4 * p * (1 - p), FORBIDDEN)

@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -46,7 +47,7 @@ WIDEST = 24  # inputs; more are projected to as many
 STEPS, CLOSE = 12, 1e-4  # of Newton's method, and the change of log odds at which it ends
 LEAP = 3.0  # of log odds in one of its steps, at most
 SURE = 1e-3  # least curvature that an episode adds, p (1 - p)
-REMEMBERED = "mean", "precision", "own", "doubt", "apart"
+REMEMBERED = "mean", "precision", "own", "unknown", "apart"
 
 
 class Belief:
@@ -89,7 +90,7 @@ class Belief:
         self._apart = torch.tensor(OWN, dtype=torch.float64)  # the variance among items
         self._expected = torch.zeros(items, dtype=torch.float64) if expected is None else expected
         self._own = self._expected
-        self._doubt = torch.full_like(self._own, OWN)  # the variance of that
+        self._unknown = torch.ones_like(self._own)  # the part of that variance which is left
         self._covariance: Tensor | None = None
 
     def grow_older(self, batches: float = 1.0) -> None:
@@ -103,7 +104,7 @@ class Belief:
         self._mean = torch.linalg.solve(self._precision, old * (precision @ (back @ self._mean)))
         left = 0.5 ** (age / LASTING)
         self._own = self._expected + left * (self._own - self._expected)
-        self._doubt = self._apart + left**2 * (self._doubt - self._apart)
+        self._unknown = 1 - left**2 * (1 - self._unknown)
         self._covariance = None
 
     def observe(
@@ -132,7 +133,7 @@ class Belief:
                 won / counts,
                 inputs.new_empty(len(items), inputs.shape[1]).index_copy(0, row, inputs),
             )
-            own, doubt = self._own[items], self._doubt[items]
+            own, doubt = self._own[items], self._apart * self._unknown[items]
         phi, prior, precision = self._columns(inputs), self._mean, self._precision
         z, mean, u = phi @ prior, prior, own
         for _ in range(STEPS):
@@ -154,8 +155,11 @@ class Belief:
         self._precision = precision + _curvature(phi, bend / (1 + bend * doubt))
         if items is not None:
             self._own = self._own.index_copy(0, items, u)
-            self._doubt = self._doubt.index_copy(0, items, doubt / (1 + bend * doubt))
-            self._tell_apart(items)
+            left = self._unknown[items] / (1 + bend * doubt)
+            self._unknown = self._unknown.index_copy(0, items, left)
+            square = (u - self._expected[items]).square() + self._apart * left
+            moved = (square - self._apart).sum() / (STEADY + len(items))  # a step of EM
+            self._apart = self._apart + moved
 
     def predict(self, inputs: Tensor, items: Tensor | None = None) -> Tensor:
         """Returns the probability of success on levels, float64 [n].
@@ -169,7 +173,7 @@ class Belief:
         phi = self._columns(inputs)
         z, variance = phi @ self._mean, ((phi @ self._covariance) * phi).sum(-1)
         if items is not None:
-            z, variance = z + self._own[items], variance + self._doubt[items]
+            z, variance = z + self._own[items], variance + self._apart * self._unknown[items]
         return (z / (1 + math.pi / 8 * variance).sqrt()).sigmoid()
 
     def draw(self, inputs: Tensor, items: Tensor, generator: torch.Generator) -> Tensor:
@@ -182,11 +186,12 @@ class Belief:
             items: likewise.
             generator: of the CPU.
         """
-        size, kind = len(self._mean), {"generator": generator, "dtype": torch.float64}
-        noise = torch.randn(size, 1, **kind)
-        factor = torch.linalg.cholesky(self._precision)
-        mean = self._mean + torch.linalg.solve_triangular(factor.mT, noise, upper=True)[:, 0]
-        own = self._own[items] + self._doubt[items].sqrt() * torch.randn(len(items), **kind)
+        normal = partial(torch.randn, generator=generator, dtype=torch.float64)
+        factor = torch.linalg.cholesky(self._precision).mT
+        noise = torch.linalg.solve_triangular(factor, normal(len(factor), 1), upper=True)
+        mean = self._mean + noise[:, 0]
+        doubt = self._apart * self._unknown[items]
+        own = self._own[items] + doubt.sqrt() * normal(len(items))
         return (self._columns(inputs) @ mean + own).sigmoid()
 
     def state_dict(self) -> dict[str, Any]:
@@ -198,12 +203,6 @@ class Belief:
         for name in REMEMBERED:
             setattr(self, f"_{name}", state[name])
         self._covariance = None
-
-    def _tell_apart(self, items: Tensor) -> None:
-        """Moves the variance among items towards that of some, by a step of EM."""
-        square = (self._own - self._expected)[items].square() + self._doubt[items]
-        moved = (square - self._apart).sum() / (STEADY + len(items))
-        self._apart = self._apart + moved
 
     def _columns(self, inputs: Tensor) -> Tensor:
         """Returns the columns of inputs [n, D]: [n, F]."""

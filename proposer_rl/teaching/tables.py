@@ -113,8 +113,8 @@ def ranks(table: Tensor) -> Tensor:
     """
     columns = table.double().mT.contiguous()
     rising, order = columns.sort()
-    both = sum(torch.searchsorted(rising, rising, right=right) for right in (False, True))
-    middle = (both / len(table) - 1).float()
+    below, upto = (torch.searchsorted(rising, rising, right=right) for right in (False, True))
+    middle = ((below + upto) / len(table) - 1).float()
     return torch.empty_like(middle).scatter_(1, order, middle).mT.contiguous()
 
 
