@@ -21,6 +21,11 @@ often, the best take their place. Candidates are new levels of the space and lev
 of the last batch's way and the target, where the space knows what lies between two levels: the
 interpolation of Klink et al. 2022, "Curriculum Reinforcement Learning via Constrained Optimal
 Transport" (ICML), with particles in place of bins, and no pace but what is mastered.
+
+A data set has items that come back, and nothing between two of them. There is nothing to be made,
+so that there are more candidates, all different, and learnability counts for more; and their
+success is drawn from the posterior, so that items of which little or nothing new is known are
+tried again.
 """
 
 from __future__ import annotations
@@ -80,7 +85,8 @@ class AdaptiveMixture(Curriculum):
 
     Args:
         space: where levels come from. ``between(a, b, noise, generator)`` gives levels on the way,
-            ``items(levels)`` the numbers of levels that come back one by one.
+            ``items(levels)`` the numbers of levels that come back one by one, ``expected`` log odds
+            of success of each, float64 [N], before anything is seen.
         target: what is to be mastered; None where all levels of the space count: then there are
             the uniform arm and the way alone, whose levels are learnable ones near to uniform ones.
         inputs: what the belief knows of levels; None for what the space says, see

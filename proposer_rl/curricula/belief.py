@@ -9,8 +9,13 @@ for Large-Scale Kernel Machines", NeurIPS), and for levels that come back one by
 items of a data set, what is item i's own, u_i. Both have normal distributions. A batch moves them
 to the maximum of their posterior, by Newton's method, with the curvature there as the new precision
 (Laplace's approximation, one batch after another: Spiegelhalter and Lauritzen 1990, "Sequential
-updating of conditional probabilities on directed graphical structures", Networks 20). Its cost is
-linear in the levels of the batch, and nothing is kept of earlier ones.
+updating of conditional probabilities on directed graphical structures", Networks 20). A group of G
+episodes counts as G. Its cost is linear in the levels of the batch, and nothing is kept of earlier
+ones.
+
+Both are moved together: with v the variance of u_i, w = G p (1 - p) and g = G (p - label), u_i is
+eliminated from Newton's equations, which leaves the weight w / (1 + v w) for beta and the slope
+g - w (v g + u_i - before) / (1 + v w), so that many answers to one item say little of the others.
 
 The student moves. At every batch, with lambda = 2 ** (-1 / half_life), what was known fades towards
 the prior, precision P and P beta alike:
@@ -20,6 +25,14 @@ the prior, precision P and P beta alike:
 so that a level that is ``age`` batches old has the weight 2 ** (-age / half_life). The second
 column is minus a level's age in half-lives, 0 now: a trend. Growing older by a batch is a linear
 map A of the columns, so that first beta <- A^-T beta and P <- A P A^T.
+
+What is an item's own goes back to what is expected of it, the log odds of a pass rate or 0, with a
+half-life LASTING times as long, and its variance to V, that among items:
+
+    u <- e + mu (u - e),      v <- V + mu^2 (v - V),      mu = 2 ** (-1 / (LASTING half_life)),
+
+and V moves by a step of expectation-maximization at every batch, towards the mean of
+(u - e)^2 + v of its items.
 
 The expectation of success is that of MacKay 1992, "The evidence framework applied to classification
 networks" (Neural Computation 4): with s^2 the variance of z,
@@ -56,6 +69,8 @@ class Belief:
     Args:
         inputs: numbers D that are known of a level.
         items: number N of levels that come back, each with a memory of its own; 0 for none.
+        expected: log odds of success that are an item's own before anything is seen, float64 [N];
+            None for 0.
         half_life: batches after which a level counts half.
         ridge: prior precision of coefficients.
     """

@@ -221,6 +221,7 @@ OTHERS: dict[str, tuple[Any, Any, str]] = {
     "a bit smaller": (ranges(), prl.Parameters({"slope": (0.0, 7.9999999)}), "is 0 to 7.9999999"),
     "fewer items": (ITEMS, prl.Items(10), "count was 100, is 10"),
     "other features": (ITEMS, prl.Items(100, features=torch.eye(100)), "feat"),
+    "pass rates": (ITEMS, prl.Items(100, pass_rates=[0.5] * 100), "pass_rates was missing"),
     "another target": (prl.Items(9, target=[1]), prl.Items(9, target=[2]), r"was \[1\], is \[2\]"),
     "no target": (ranges(target={"slope": 8}), ranges(), "target.slope was .8.*, is missing"),
     "another name": (
