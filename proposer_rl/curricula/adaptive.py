@@ -21,6 +21,11 @@ often, the best take their place. Candidates are new levels of the space and lev
 of the last batch's way and the target, where the space knows what lies between two levels: the
 interpolation of Klink et al. 2022, "Curriculum Reinforcement Learning via Constrained Optimal
 Transport" (ICML), with particles in place of bins, and no pace but what is mastered.
+
+A data set has items that come back, and nothing between two of them. There is nothing to be made,
+so that there are more candidates, all different, and learnability counts for more; and their
+success is drawn from the posterior, so that items of which little or nothing new is known are
+tried again.
 """
 
 from __future__ import annotations
@@ -61,6 +66,7 @@ SOON, LATER = 6.0, 20.0  # half-lives in batches: of sums, and of b where succes
 FEW = 16  # levels, of which fewer are counted as a part of a batch
 RARE = 0.02  # share of successes, below which the belief learns from returns, too
 LEARNABLE = 0.2  # of the bonus, in squared distances per input
+ITEMS_LEARNABLE, ITEMS_TIMES = 1.0, 4  # that, and times as many candidates, of a data set
 NEAR = 0.025  # standard deviation of what is added between two levels, in shares of a range
 # Levels of the way that are assigned to draws of the target together. The time of an assignment
 # grows faster than with the square: of 288, it is 10 ms in blocks of 64, 30 of 128, 150 at once.
@@ -83,7 +89,8 @@ class AdaptiveMixture(Curriculum):
 
     Args:
         space: where levels come from. ``between(a, b, noise, generator)`` gives levels on the way,
-            ``items(levels)`` the numbers of levels that come back one by one.
+            ``items(levels)`` the numbers of levels that come back one by one, ``expected`` log odds
+            of success of each, float64 [N], before anything is seen.
         target: what is to be mastered; None where all levels of the space count: then there are
             the uniform arm and the way alone, whose levels are learnable ones near to uniform ones.
         inputs: what the belief knows of levels; None for what the space says, see
@@ -107,6 +114,8 @@ class AdaptiveMixture(Curriculum):
         times: Count = 4,
     ) -> None:
         self._space, self._target = space, target
+        # A data set has items, and nothing between two of them.
+        self._is_data = hasattr(space, "items") and not hasattr(space, "between")
         self._known = inputs or partial(level_inputs, space)
         self._delta, self._half_life, self._times = delta, half_life, times
         self._inbox = Inbox()
@@ -144,6 +153,8 @@ class AdaptiveMixture(Curriculum):
             for name in ("return", "success")
             if name in outcome.keys()
         }
+        if "episodes" in outcome.keys() and "rollout" not in outcome.keys():
+            results["counts"] = outcome["episodes"].double().cpu()  # that the means are of
         self._inbox.put(batch, **batch.notes.exclude("number", "place", "size"), **results)
 
     def log(self) -> dict[str, Any]:
@@ -185,7 +196,11 @@ class AdaptiveMixture(Curriculum):
         one = self._space.sample(1, torch.Generator())
         items = 0 if self._items(one) is None else self._space.size
         width = self._inputs(one).shape[-1]
-        made = (Belief(width, items, half_life=self._half_life) for _ in range(students))
+        expected = getattr(self._space, "expected", None)
+        made = (
+            Belief(width, items, expected=expected, half_life=self._half_life)
+            for _ in range(students)
+        )
         self._beliefs = list(made)
         self._sums = self._sums.new_zeros(students, *self._sums.shape[1:])
         self._best = self._best.new_zeros(students)
@@ -197,11 +212,11 @@ class AdaptiveMixture(Curriculum):
             returns = seen["return"]
             success, labels = self._labels(returns, seen.get("success", None))
             batches = labels.shape[1] / max(int(seen["size"][0, 0]), FEW)  # that have passed
-            which = _each(seen.get("items", None), len(labels))
-            every = zip(self._beliefs, seen["inputs"], labels, which, strict=True)
-            for belief, x, label, own in every:
+            which, counts = (_each(seen.get(n, None), len(labels)) for n in ("items", "counts"))
+            every = zip(self._beliefs, seen["inputs"], labels, which, counts, strict=True)
+            for belief, x, label, own, count in every:
                 belief.grow_older(batches)
-                belief.observe(x, label, own)
+                belief.observe(x, label, own, count)
             self._seen.append((seen["predicted"], success))
             of = {
                 "levels": torch.ones_like(labels),
@@ -285,15 +300,22 @@ class AdaptiveMixture(Curriculum):
         """Returns levels [n] that are mastered, and near to the target."""
         goal = self._space if self._target is None else self._target
         targets = goal.sample(count, draw)
-        levels = self._candidates(k, self._times * count, targets, draw)
+        times = self._times * (ITEMS_TIMES if self._is_data else 1)
+        levels = self._candidates(k, times * count, targets, draw)
         goals, x, items = self._inputs(targets), self._inputs(levels), self._items(levels)
-        p = self._beliefs[k].predict(x, items)
+        belief = self._beliefs[k]
+        # Items are explored by draws, which differ where little is known, or nothing new.
+        if items is None or not self._is_data:
+            p = belief.predict(x, items)
+        else:
+            p = belief.draw(x, items, draw)
         allowed = p >= p.topk(count).values[-1].clamp(max=self._delta)
-        extra = torch.where(allowed, -LEARNABLE * 4 * p * (1 - p), FORBIDDEN)
+        bonus = ITEMS_LEARNABLE if self._is_data else LEARNABLE
+        extra = torch.where(allowed, -bonus * 4 * p * (1 - p), FORBIDDEN)
         chosen = []
         for start in range(0, count, AT_ONCE):
             end = min(start + AT_ONCE, count)
-            few = slice(self._times * start, self._times * end)
+            few = slice(times * start, times * end)
             far = torch.cdist(goals[start:end], x[few]).square() / max(x.shape[1], 1)
             chosen.append(few.start + assigned(far + extra[few]))
         self._last[str(k)] = levels[torch.cat(chosen)]
@@ -302,6 +324,11 @@ class AdaptiveMixture(Curriculum):
     def _candidates(self, k: int, count: int, targets: Levels, draw: torch.Generator) -> Levels:
         """Returns levels [n] of the space and, if it can tell, between the last way and targets."""
         space: Any = self._space
+        if self._is_data:  # none twice, where there are enough
+            order = torch.randperm(space.size, generator=draw)
+            places = order.repeat(-(-count // space.size))[:count]
+            made: Levels = space.generate(places[None], [draw])[0]
+            return made
         if not hasattr(space, "between"):
             return space.sample(count, draw)
         half = count // 2

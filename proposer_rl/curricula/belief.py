@@ -9,8 +9,13 @@ for Large-Scale Kernel Machines", NeurIPS), and for levels that come back one by
 items of a data set, what is item i's own, u_i. Both have normal distributions. A batch moves them
 to the maximum of their posterior, by Newton's method, with the curvature there as the new precision
 (Laplace's approximation, one batch after another: Spiegelhalter and Lauritzen 1990, "Sequential
-updating of conditional probabilities on directed graphical structures", Networks 20). Its cost is
-linear in the levels of the batch, and nothing is kept of earlier ones.
+updating of conditional probabilities on directed graphical structures", Networks 20). A group of G
+episodes counts as G. Its cost is linear in the levels of the batch, and nothing is kept of earlier
+ones.
+
+Both are moved together: with v the variance of u_i, w = G p (1 - p) and g = G (p - label), u_i is
+eliminated from Newton's equations, which leaves the weight w / (1 + v w) for beta and the slope
+g - w (v g + u_i - before) / (1 + v w), so that many answers to one item say little of the others.
 
 The student moves. At every batch, with lambda = 2 ** (-1 / half_life), what was known fades towards
 the prior, precision P and P beta alike:
@@ -20,6 +25,14 @@ the prior, precision P and P beta alike:
 so that a level that is ``age`` batches old has the weight 2 ** (-age / half_life). The second
 column is minus a level's age in half-lives, 0 now: a trend. Growing older by a batch is a linear
 map A of the columns, so that first beta <- A^-T beta and P <- A P A^T.
+
+What is an item's own goes back to what is expected of it, the log odds of a pass rate or 0, with a
+half-life LASTING times as long, and its variance to V, that among items:
+
+    u <- e + mu (u - e),      v <- V + mu^2 (v - V),      mu = 2 ** (-1 / (LASTING half_life)),
+
+and V moves by a step of expectation-maximization at every batch, towards the mean of
+(u - e)^2 + v of its items.
 
 The expectation of success is that of MacKay 1992, "The evidence framework applied to classification
 networks" (Neural Computation 4): with s^2 the variance of z,
@@ -31,6 +44,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -39,11 +53,14 @@ from torch import Tensor
 WAVES = 64  # random Fourier features
 LENGTHS = 0.3, 1.5  # of the waves, in units of the root of D, on a logarithmic scale
 ROUGHNESS = 2.0  # prior variance of the log odds that the waves add
-OWN = 1.0  # prior variance of the log odds that are an item's own
+OWN = 1.0  # variance at first of the log odds that are an item's own
+LASTING = 16.0  # half-lives of these, in that of the coefficients
+STEADY = 256.0  # items that the variance is the mean of
 WIDEST = 24  # inputs; more are projected to as many
 STEPS, CLOSE = 12, 1e-4  # of Newton's method, and the change of log odds at which it ends
 LEAP = 3.0  # of log odds in one of its steps, at most
-SURE = 1e-3  # least curvature that a level adds, p (1 - p)
+SURE = 1e-3  # least curvature that an episode adds, p (1 - p)
+REMEMBERED = "mean", "precision", "own", "unknown", "apart"
 
 
 class Belief:
@@ -52,12 +69,20 @@ class Belief:
     Args:
         inputs: numbers D that are known of a level.
         items: number N of levels that come back, each with a memory of its own; 0 for none.
+        expected: log odds of success that are an item's own before anything is seen, float64 [N];
+            None for 0.
         half_life: batches after which a level counts half.
         ridge: prior precision of coefficients.
     """
 
     def __init__(
-        self, inputs: int, items: int = 0, *, half_life: float = 12.0, ridge: float = 0.3
+        self,
+        inputs: int,
+        items: int = 0,
+        *,
+        expected: Tensor | None = None,
+        half_life: float = 12.0,
+        ridge: float = 0.3,
     ) -> None:
         generator = torch.Generator().manual_seed(0)
 
@@ -77,8 +102,10 @@ class Belief:
         self._prior = ridge * torch.eye(size, dtype=torch.float64)
         self._mean = torch.zeros(size, dtype=torch.float64)
         self._precision = self._prior
-        self._own = torch.zeros(items, dtype=torch.float64)
-        self._known = torch.full_like(self._own, 1 / OWN)  # the precision of that
+        self._apart = torch.tensor(OWN, dtype=torch.float64)  # the variance among items
+        self._expected = torch.zeros(items, dtype=torch.float64) if expected is None else expected
+        self._own = self._expected
+        self._unknown = torch.ones_like(self._own)  # the part of that variance which is left
         self._covariance: Tensor | None = None
 
     def grow_older(self, batches: float = 1.0) -> None:
@@ -90,36 +117,64 @@ class Belief:
         precision = aged @ self._precision @ aged.mT
         self._precision = old * precision + new * self._prior
         self._mean = torch.linalg.solve(self._precision, old * (precision @ (back @ self._mean)))
-        weighed = old * self._known * self._own
-        self._known = old * self._known + new / OWN
-        self._own = weighed / self._known
+        left = 0.5 ** (age / LASTING)
+        self._own = self._expected + left * (self._own - self._expected)
+        self._unknown = 1 - left**2 * (1 - self._unknown)
         self._covariance = None
 
-    def observe(self, inputs: Tensor, labels: Tensor, items: Tensor | None = None) -> None:
+    def observe(
+        self,
+        inputs: Tensor,
+        labels: Tensor,
+        items: Tensor | None = None,
+        counts: Tensor | None = None,
+    ) -> None:
         """Learns from levels that the student was trained on.
 
         Args:
             inputs: float64 [n, D].
             labels: successes, or shares of them, in [0, 1]: float64 [n].
             items: which of those that come back they are, int64 [n]; None where none do.
+            counts: episodes that each label is the mean of, float64 [n]; None for one.
         """
+        counts = torch.ones_like(labels) if counts is None else counts
+        if items is None:
+            own = doubt = torch.zeros_like(labels)
+        else:
+            items, row = items.unique(return_inverse=True)
+            none = torch.zeros(len(items), dtype=torch.float64)
+            won, counts = (none.index_add(0, row, one) for one in (counts * labels, counts))
+            labels, inputs = (
+                won / counts,
+                inputs.new_empty(len(items), inputs.shape[1]).index_copy(0, row, inputs),
+            )
+            own, doubt = self._own[items], self._apart * self._unknown[items]
         phi, prior, precision = self._columns(inputs), self._mean, self._precision
-        own = torch.zeros_like(labels) if items is None else self._own[items]
-        z, mean = phi @ prior, prior
+        z, mean, u = phi @ prior, prior, own
         for _ in range(STEPS):
-            p = (z + own).sigmoid()
-            slope = phi.mT @ (p - labels) + precision @ (mean - prior)
-            step = torch.linalg.solve(precision + _curvature(phi, p), slope)
+            p = (z + u).sigmoid()
+            pull, bend = counts * (p - labels), counts * _bend(p)
+            free = 1 + bend * doubt
+            rest = pull - bend * (doubt * pull + (u - own)) / free
+            slope = phi.mT @ rest + precision @ (mean - prior)
+            step = torch.linalg.solve(precision + _curvature(phi, bend / free), slope)
             moved = phi @ step
-            size = moved.abs().max()
+            shift = (doubt * (pull - bend * moved) + (u - own)) / free
+            size = torch.maximum(moved.abs().max(), shift.abs().max())
             part = LEAP / size.clamp(min=LEAP)
-            mean, z = mean - part * step, z - part * moved
+            mean, z, u = mean - part * step, z - part * moved, u - part * shift
             if float(size) < CLOSE:
                 break
+        bend = counts * _bend((z + u).sigmoid())
         self._mean, self._covariance = mean, None
-        self._precision = precision + _curvature(phi, (z + own).sigmoid())
+        self._precision = precision + _curvature(phi, bend / (1 + bend * doubt))
         if items is not None:
-            self._observe_items(items, z, labels)
+            self._own = self._own.index_copy(0, items, u)
+            left = self._unknown[items] / (1 + bend * doubt)
+            self._unknown = self._unknown.index_copy(0, items, left)
+            square = (u - self._expected[items]).square() + self._apart * left
+            moved = (square - self._apart).sum() / (STEADY + len(items))  # a step of EM
+            self._apart = self._apart + moved
 
     def predict(self, inputs: Tensor, items: Tensor | None = None) -> Tensor:
         """Returns the probability of success on levels, float64 [n].
@@ -133,31 +188,36 @@ class Belief:
         phi = self._columns(inputs)
         z, variance = phi @ self._mean, ((phi @ self._covariance) * phi).sum(-1)
         if items is not None:
-            z, variance = z + self._own[items], variance + 1 / self._known[items]
+            z, variance = z + self._own[items], variance + self._apart * self._unknown[items]
         return (z / (1 + math.pi / 8 * variance).sqrt()).sigmoid()
 
+    def draw(self, inputs: Tensor, items: Tensor, generator: torch.Generator) -> Tensor:
+        """Draws a probability of success on each level from the posterior, float64 [n].
+
+        Coefficients are drawn once, what is the items' own for each.
+
+        Args:
+            inputs: as of :meth:`observe`.
+            items: likewise.
+            generator: of the CPU.
+        """
+        normal = partial(torch.randn, generator=generator, dtype=torch.float64)
+        factor = torch.linalg.cholesky(self._precision).mT
+        noise = torch.linalg.solve_triangular(factor, normal(len(factor), 1), upper=True)
+        mean = self._mean + noise[:, 0]
+        doubt = self._apart * self._unknown[items]
+        own = self._own[items] + doubt.sqrt() * normal(len(items))
+        return (self._columns(inputs) @ mean + own).sigmoid()
+
     def state_dict(self) -> dict[str, Any]:
-        """Returns means and precisions."""
-        return {name: getattr(self, f"_{name}") for name in ("mean", "precision", "own", "known")}
+        """Returns means, precisions and variances."""
+        return {name: getattr(self, f"_{name}") for name in REMEMBERED}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Puts back what :meth:`state_dict` returned."""
-        for name, value in state.items():
-            setattr(self, f"_{name}", value)
+        for name in REMEMBERED:
+            setattr(self, f"_{name}", state[name])
         self._covariance = None
-
-    def _observe_items(self, items: Tensor, z: Tensor, labels: Tensor) -> None:
-        """Moves what is the items' own, given what the inputs say of them, z [n]."""
-        prior, own, bend = self._own, self._own, self._known
-        for _ in range(STEPS):
-            p = (z + own[items]).sigmoid()
-            slope = (self._known * (own - prior)).scatter_add(0, items, p - labels)
-            bend = self._known.scatter_add(0, items, (p * (1 - p)).clamp(min=SURE))
-            step = (slope / bend).clamp(-LEAP, LEAP)
-            own = own - step
-            if float(step.abs().max()) < CLOSE:
-                break
-        self._own, self._known = own, bend
 
     def _columns(self, inputs: Tensor) -> Tensor:
         """Returns the columns of inputs [n, D]: [n, F]."""
@@ -167,5 +227,9 @@ class Belief:
         return torch.cat([one, torch.zeros_like(one), x, x.square(), waves], -1)
 
 
-def _curvature(phi: Tensor, p: Tensor) -> Tensor:
-    return phi.mT @ (phi * (p * (1 - p)).clamp(min=SURE).unsqueeze(-1))
+def _bend(p: Tensor) -> Tensor:
+    return (p * (1 - p)).clamp(min=SURE)
+
+
+def _curvature(phi: Tensor, bend: Tensor) -> Tensor:
+    return phi.mT @ (phi * bend.unsqueeze(-1))

@@ -135,6 +135,8 @@ FREE = {  # of what needs nothing of a learner, settings that are small
     "adr": {"episodes": 2},
     "spdl": {"episodes": 8},
     "adaptive_mixture": {},
+    "mopps": {},
+    "arc_length": {},
     "model_transport": {"probes": 1},
     "mixture": {"parts": {"currot": {"probes": 1}}},
 }
@@ -174,6 +176,7 @@ def test_whoever_needs_nothing_works_from_returns_and_success(name: str, space: 
         settings = {"distributions": ["id", "id"], "until": [2]}
     recipe = getattr(prl.curricula, name)(**settings)
     bins = {"alp_gmm", "adr", "spdl", "learning_progress", "model_transport", "mixture"}
+    bins |= {"mopps", "arc_length"}
     if space == "a generator" and name in bins:
         with pytest.raises(ArgumentError, match="draws from bins"):
             prl.Teacher(recipe, SPACES[space]())
@@ -220,6 +223,7 @@ OTHERS: dict[str, tuple[Any, Any, str]] = {
     "a bit smaller": (ranges(), prl.Parameters({"slope": (0.0, 7.9999999)}), "is 0 to 7.9999999"),
     "fewer items": (ITEMS, prl.Items(10), "count was 100, is 10"),
     "other features": (ITEMS, prl.Items(100, features=torch.eye(100)), "feat"),
+    "pass rates": (ITEMS, prl.Items(100, pass_rates=[0.5] * 100), "pass_rates was missing"),
     "another target": (prl.Items(9, target=[1]), prl.Items(9, target=[2]), r"was \[1\], is \[2\]"),
     "no target": (ranges(target={"slope": 8}), ranges(), "target.slope was .8.*, is missing"),
     "another name": (
