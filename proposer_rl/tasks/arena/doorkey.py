@@ -14,7 +14,7 @@ LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE = range(6)  # and 6, which does nothi
 OPEN, CLOSED, LOCKED = range(3)
 VIEW = 7
 # MiniGrid's numbers of an object, its color and its state; those of doors by their state.
-EMPTY, WALL, KEY, GOAL = (1, 0, 0), (2, 5, 0), (5, 4, 0), (8, 1, 0)
+UNSEEN, EMPTY, WALL, KEY, GOAL = (0, 0, 0), (1, 0, 0), (2, 5, 0), (5, 4, 0), (8, 1, 0)
 DOORS = [(4, 4, how) for how in (OPEN, CLOSED, LOCKED)]
 
 
@@ -81,11 +81,11 @@ class DoorkeyEnv(BatchedEnv):
         walls, keys, doors, goal = _things(state, level, to_x, to_y)
         here = (forward == 0) & (right == 0)
         how, carried = state[..., 2, None, None], state[..., 3, None, None] < 0
-        looks = state.new_tensor([EMPTY, WALL, KEY, GOAL, *DOORS])
-        kind = walls * 1 + keys * 2 + goal * 3 + doors * (4 + how)
-        kind = torch.where(here, 2 * carried, kind).long()
-        closed = ~here & (walls | (doors & (how != OPEN)))
-        return (looks[kind] * _seen(~closed).unsqueeze(-1)).flatten(-3)
+        kind = 1 + walls * 1 + keys * 2 + goal * 3 + doors * (4 + how.int())
+        kind = torch.where(here, 1 + 2 * carried, kind)
+        closed = walls | (doors & (how != OPEN))
+        looks = state.new_tensor([UNSEEN, EMPTY, WALL, KEY, GOAL, *DOORS])
+        return looks[kind * _seen(~closed | here)].flatten(-3)
 
 
 def _aside(way: Tensor) -> Tensor:
@@ -110,25 +110,33 @@ def _things(
 
 
 def _seen(clear: Tensor) -> Tensor:
-    """Returns what is seen of a view [*B, 7, 7] from its lowest row's middle, as MiniGrid does.
+    """Returns what is seen of a view [*B, 7, 7] from its lowest row's middle, as MiniGrid does."""
+    bits = 2 ** torch.arange(VIEW, device=clear.device)
+    row, rows = 2 ** (VIEW // 2), []
+    seen, above = SIGHT.to(clear.device)
+    for ahead in reversed((clear * bits).sum(-1).unbind(-1)):
+        place = 2**VIEW * row + ahead
+        rows.append(seen[place])
+        row = above[place]
+    return (torch.stack(rows[::-1], -1).unsqueeze(-1) & bits) > 0
 
-    Sight goes along a row from clear cell to cell, and from clear cells to the three above.
+
+def _sight() -> Tensor:
+    """Returns what is seen of a row and of the one above: bits [2, 128 * 128].
+
+    Sight goes along a row from clear cell to cell, and from clear cells to the three above. Rows
+    are numbers of a bit for each cell, of what is seen from below and of what is clear.
     """
-    row = torch.zeros_like(clear[..., 0, :])
-    row[..., VIEW // 2] = True
-    rows = []
-    for ahead in reversed(clear.unbind(-2)):
-        for _ in range(VIEW - 1):
-            row = row | _beside(row & ahead)
-        rows.append(row)
-        row = row & ahead
-        row = row | _beside(row)
-    return torch.stack(rows[::-1], -2)
+    every = torch.arange(2**VIEW)
+    row, clear = every.repeat_interleave(2**VIEW), every.repeat(2**VIEW)
+    for _ in range(VIEW - 1):
+        row = row | _beside(row & clear)
+    above = row & clear
+    return torch.stack([row, above | _beside(above)])
 
 
-def _beside(cells: Tensor) -> Tensor:
-    """Returns the cells [*B, 7] to the left and to the right of those given."""
-    beside = torch.zeros_like(cells)
-    beside[..., 1:] |= cells[..., :-1]
-    beside[..., :-1] |= cells[..., 1:]
-    return beside
+def _beside(row: Tensor) -> Tensor:
+    return (row << 1 | row >> 1) & (2**VIEW - 1)
+
+
+SIGHT = _sight()
