@@ -22,7 +22,7 @@ class TaughtTasks:
 
     Args:
         teacher: of :class:`~proposer_rl.teaching.Items`, one for each task.
-        tasks: a finite set, whose ``key`` tells one from another.
+        tasks: a finite set, each with a ``key`` of its own.
         sources: where each is from, [N], by which :meth:`metrics` are given, too; None for one.
 
     Raises:

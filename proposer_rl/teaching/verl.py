@@ -28,13 +28,13 @@ class TaughtSampler(TeacherSampler, AbstractCurriculumSampler):
         source: data_source             # a column by which metrics are given, too
         success: acc                    # of a batch, from 0 to 1; else the sum of its scores
 
-    Prompts are told apart by ``data_source`` and ``extra_info.index``; an epoch has whole batches.
+    Prompts are recognised by ``data_source`` and ``extra_info.index``; an epoch has whole batches.
     The data loader's state holds the curriculum. As verl saves a step's checkpoint before it
     updates the sampler, that step's answers are lost to a resumed curriculum, which drops them.
 
     Raises:
         ArgumentError: naming a setting that is unknown, a column that is missing, or prompts that
-            cannot be told apart.
+            cannot be distinguished.
     """
 
     def __init__(self, data_source: Any, data_config: Any) -> None:

@@ -6,6 +6,7 @@ import importlib
 import sys
 from collections.abc import Iterator
 from itertools import islice
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -20,6 +21,7 @@ from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching.prime_rl import TaughtTasks
 from tests.teaching.test_sampler import through_torch
 
+PAGE = (Path(__file__).parents[2] / "docs" / "how_to" / "prompts.md").read_text(encoding="utf-8")
 ROWS, ANSWERS, BATCH = 11, 4, 4
 
 
@@ -174,6 +176,16 @@ def test_verl_is_refused_in_one_line(taught_sampler: Any, what: str) -> None:
         )
 
 
+def test_the_page_configures_verl(taught_sampler: Any) -> None:
+    """Its class and all settings, for rows and batches that have what it names."""
+    data = OmegaConf.create(PAGE.split("```yaml\n")[1].split("```")[0]).data
+    assert data.sampler.class_path == f"pkg://{taught_sampler.__module__}"
+    assert data.sampler.class_name == taught_sampler.__name__
+    sampler = verl(taught_sampler, **data.sampler)
+    assert [*steps(sampler, loaded(sampler), data.sampler.success)]
+    assert {"predicted", "yield/words"} <= sampler.metrics().keys()
+
+
 class Curriculum:
     """prime-rl's: it asks its sampler for the next task, and tells it of each group."""
 
@@ -224,6 +236,14 @@ def test_prime_rl_draws_and_observes() -> None:
     curriculum.on_result([episode(tasks[2])])
     rest = [[next(one.sampler).key for _ in range(6)] for one in (curriculum, again)]
     assert rest[0] == rest[1]
+
+
+def test_the_page_puts_a_sampler_into_prime_rl() -> None:
+    curriculum = Curriculum(None)
+    source = SimpleNamespace(curricula={"math": curriculum})
+    names = {"train_source": source, "teacher": prime()[0], "tasks": TASKS}
+    exec(PAGE.partition("## prime-rl")[2].split("```")[1], names)
+    assert next(curriculum.sampler) in TASKS
 
 
 def test_prime_rl_is_refused_in_one_line() -> None:

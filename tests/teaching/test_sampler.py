@@ -229,6 +229,28 @@ def test_loaders_that_go_on_find_the_place(stateful: bool) -> None:
         assert [*begun, *train(sampler, loader, steps)] == whole
 
 
+@pytest.mark.slow
+def test_loaders_with_workers_go_on_validly() -> None:
+    """An item of an epoch is told once, and its length is kept, though batches are drawn ahead."""
+    stateful = pytest.importorskip("torchdata.stateful_dataloader").StatefulDataLoader
+
+    def train(loader: Any, sampler: prl.TeacherSampler) -> Iterator[list[int]]:
+        for batch in loader:
+            sampler.tell(batch, [1.0] * len(batch))
+            yield batch.tolist()
+
+    _, sampler = replayed(length=24, repeat=1, group=1, rounds=1)
+    loader = stateful(range(9), 4, sampler=sampler, num_workers=1)
+    assert len([*islice(train(loader, sampler), 3)]) == 3
+    states = through_torch([sampler._teacher.state_dict(), loader.state_dict()])
+    teacher, sampler = replayed(length=24, repeat=1, group=1, rounds=1)
+    teacher.load_state_dict(states[0])
+    loader = stateful(range(9), 4, sampler=sampler, num_workers=1)
+    loader.load_state_dict(states[1])
+    assert len([*train(loader, sampler)]) == 3
+    assert not any(sampler.state_dict()["out"].values())
+
+
 class Ranks:
     """torch.distributed in threads of this process."""
 
@@ -423,14 +445,14 @@ def loop(
 def test_a_loader_that_draws_ahead_goes_on_bit_by_bit_or_at_least_validly() -> None:
     """By the states of now, rewound; and by that of the sampler when a batch was drawn."""
 
-    def train(sampler: prl.TeacherSampler, done: int = 0, until: int = 10) -> list[list[int]]:
+    def train(sampler: prl.TeacherSampler, done: int = 0, until: int = 9) -> list[list[int]]:
         seen = []
         for _, batch in loop(sampler, 3, done, until):
             sampler.tell(batch, [float(item % 4 == i % 2 == 0) for i, item in enumerate(batch)])
             seen.append(batch)
         return seen
 
-    sizes = {"length": 40, "repeat": 1, "group": 1, "rounds": 1}
+    sizes = {"length": 36, "repeat": 1, "group": 1, "rounds": 1}
     whole = train(replayed(**sizes)[1])
     assert whole != [*parts(replayed(**sizes)[1], 4)]  # what is told has an effect
     teacher, sampler = replayed(**sizes)
