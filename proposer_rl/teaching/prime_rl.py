@@ -35,8 +35,9 @@ class TaughtTasks:
         self._sampler = TeacherSampler(teacher, 1, sources=sources)
         self._teacher, self._tasks = teacher, tasks
         self._places = {task.key: place for place, task in enumerate(tasks)}
-        if len(tasks) != teacher.space.size:
-            raise ArgumentError(f"tasks: are {len(tasks)}, the teacher has {teacher.space.size}")
+        space: Any = teacher.space
+        if len(tasks) != space.size:
+            raise ArgumentError(f"tasks: are {len(tasks)}, the teacher has {space.size}")
         if len(self._places) < len(tasks):
             raise ArgumentError("tasks: must have a key each that no other has")
 

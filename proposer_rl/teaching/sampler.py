@@ -316,8 +316,11 @@ def mixed_groups(
         most: calls of it, after which there may be fewer groups.
 
     Raises:
-        ArgumentError: if its results are no such numbers; the items are dropped then.
+        ArgumentError: if its results are no such numbers, whose items are dropped then; if the
+            teacher's levels are no items.
     """
+    if not isinstance(teacher.space, Items):
+        raise ArgumentError("teacher: must have a space of Items")
     drawn: list[int] = []
     groups: list[Tensor] = []
     places: list[int] = []

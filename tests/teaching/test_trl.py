@@ -152,7 +152,7 @@ def real(reward: Any, settings: Settings, folder: Path) -> Any:
     model = GPT2LMHeadModel(GPT2Config(**sizes, eos_token_id=1, pad_token_id=0))
     quiet = {"use_cpu": True, "bf16": False, "report_to": [], "disable_tqdm": True}
     groups = {"num_generations": ANSWERS, "max_completion_length": 1, **settings}
-    often = {"save_steps": 1, "eval_strategy": "steps", "eval_steps": 1, "logging_steps": 1000}
+    often = {"save_steps": 1, "eval_strategy": "steps", "eval_steps": 1, "logging_steps": 1}
     config = GRPOConfig(str(folder), **groups, **quiet, **often, per_device_eval_batch_size=4)
     rows = Dataset.from_list([{"prompt": f"{row}", "row": row} for row in range(ROWS)])
     made = GRPOTrainer(model, reward, config, rows, rows.select([0, 1]), processing_class=tokenizer)
@@ -253,6 +253,26 @@ def test_what_groups_were_like_is_logged(taught: Any, tmp_path: Path) -> None:
         assert trainer.logged[f"curriculum/success{of}"] == right
     with pytest.raises(ArgumentError, match="trainer: is another one"):
         reward.attach(trainer)
+
+
+@pytest.mark.slow
+def test_trl_logs_it_as_its_own_metrics(taught: Any, tmp_path: Path) -> None:
+    """Groups without variance and mean rewards are what TRL finds of them itself."""
+    teacher = prl.Teacher("domain_randomization", prl.Items(ROWS), block=4)
+    reward = taught(
+        teacher, lambda completions, row, **_: [i % 2 if n < 5 else 1.0 for i, n in enumerate(row)]
+    )
+    trainer = real(reward, SETTINGS["a generation a step"], tmp_path)
+    reward.attach(trainer)
+    trainer.train(4)
+    logs = [log for log in trainer.state.log_history if "curriculum/yield" in log]
+    assert len(logs) == 4
+    for log in logs:
+        assert log["curriculum/no_variance"] == pytest.approx(log["frac_reward_zero_std"])
+        assert log["curriculum/success"] == pytest.approx(log["reward"])
+    every = {name for log in trainer.state.log_history for name in log}
+    assert "eval_reward" in every
+    assert not any(name.startswith("eval_curriculum") for name in every)
 
 
 async def awaited(**_: Any) -> list[float]:
