@@ -21,6 +21,11 @@ often, the best take their place. Candidates are new levels of the space and lev
 of the last batch's way and the target, where the space knows what lies between two levels: the
 interpolation of Klink et al. 2022, "Curriculum Reinforcement Learning via Constrained Optimal
 Transport" (ICML), with particles in place of bins, and no pace but what is mastered.
+
+A data set has items that come back, and nothing between two of them. There is nothing to be made,
+so that there are more candidates, all different, and learnability counts for more; and their
+success is drawn from the posterior, so that items of which little or nothing new is known are
+tried again.
 """
 
 from __future__ import annotations
@@ -61,13 +66,16 @@ SOON, LATER = 6.0, 20.0  # half-lives in batches: of sums, and of b where succes
 FEW = 16  # levels, of which fewer are counted as a part of a batch
 RARE = 0.02  # share of successes, below which the belief learns from returns, too
 LEARNABLE = 0.2  # of the bonus, in squared distances per input
-ITEMS_LEARNABLE, ITEMS_TIMES = 1.0, 4  # that, and times as many candidates, where levels come back
+ITEMS_LEARNABLE, ITEMS_TIMES = 1.0, 4  # that, and times as many candidates, of a data set
 NEAR = 0.025  # standard deviation of what is added between two levels, in shares of a range
-AT_ONCE = 64  # levels of the way that are assigned to draws of the target together
+# Levels of the way that are assigned to draws of the target together. The time of an assignment
+# grows faster than with the square: of 288, it is 10 ms in blocks of 64, 30 of 128, 150 at once.
+AT_ONCE = 64
 FORBIDDEN = 1e3  # cost of a candidate that is not mastered
 FAILURES = 4.0  # on the target, that are taken for seen at the beginning
 LOGGED = 100  # batches at most, whose predictions a log is about
 SHOWN = 6  # levels of each arm that a reader is shown
+OUTLIERS, MOST_OUTLIERS = 1000, 63  # one in so many returns at either end; and at most
 EQUAL = 1e-9  # returns that differ no more than this are equal, in units of the largest
 
 
@@ -75,12 +83,14 @@ class AdaptiveMixture(Curriculum):
     """Mixes the target, uniform sampling and a way between them by what was seen of each.
 
     See the module for the equations. Labels are successes where they are told; else returns, as
-    shares of the range from the lowest to the highest that was seen. It asks nothing of a student,
-    so that it costs no frames and no oracle.
+    shares of the range from the lowest to the highest that was seen, less one in a thousand at
+    either end, so that an episode that went wrong does not make all others look alike. It asks
+    nothing of a student, so that it costs no frames and no oracle.
 
     Args:
         space: where levels come from. ``between(a, b, noise, generator)`` gives levels on the way,
-            ``items(levels)`` the numbers of levels that come back one by one.
+            ``items(levels)`` the numbers of levels that come back one by one, ``expected`` log odds
+            of success of each, float64 [N], before anything is seen.
         target: what is to be mastered; None where all levels of the space count: then there are
             the uniform arm and the way alone, whose levels are learnable ones near to uniform ones.
         inputs: what the belief knows of levels; None for what the space says, see
@@ -90,7 +100,7 @@ class AdaptiveMixture(Curriculum):
         times: candidates for each level of the way.
     """
 
-    remembers = ("_inbox", "_sums", "_best", "_range", "_told")
+    remembers = ("_inbox", "_sums", "_best", "_ends", "_number", "_told")
 
     @checked
     def __init__(
@@ -104,17 +114,21 @@ class AdaptiveMixture(Curriculum):
         times: Count = 4,
     ) -> None:
         self._space, self._target = space, target
+        # A data set has items, and nothing between two of them.
+        self._is_data = hasattr(space, "items") and not hasattr(space, "between")
         self._known = inputs or partial(level_inputs, space)
         self._delta, self._half_life, self._times = delta, half_life, times
         self._inbox = Inbox()
         self._beliefs: list[Belief] = []  # of each student
         self._sums = torch.zeros(0, len(ARMS), len(SUMS), dtype=torch.float64)
         self._best = torch.zeros(0, dtype=torch.float64)  # success on the target, b
-        self._range = torch.zeros(2, 0, dtype=torch.float64)  # lowest and highest return
+        # The lowest returns and the negatives of the highest [2, K, m], of how many levels.
+        self._ends, self._number = torch.zeros(2, 0, 0, dtype=torch.float64), 0
         self._told = False  # whether success is told
         self._last: dict[str, Levels] = {}  # on the way, of each student [m]
         # What was predicted, and what it was [K, m]; loops may go on for ever without a log.
         self._seen: deque[tuple[Tensor, Tensor]] = deque(maxlen=LOGGED)
+        self._proposed: tuple[Levels, Tensor] | None = None  # the last levels [n], and their arms
         self._shown: dict[str, Any] = {}
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
@@ -127,7 +141,7 @@ class AdaptiveMixture(Curriculum):
         inputs, items = self._inputs(levels), self._items(levels)
         rows = zip(self._beliefs, inputs, _each(items, len(inputs)), strict=True)
         predicted = torch.stack([belief.predict(x, which) for belief, x, which in rows])
-        self._show(levels[0], arms[0])
+        self._proposed = levels[0], arms[0]
         notes = {"arm": arms, "inputs": inputs, "predicted": predicted}
         return self._inbox.batch(levels, **notes, **({} if items is None else {"items": items}))
 
@@ -151,6 +165,9 @@ class AdaptiveMixture(Curriculum):
         :func:`~proposer_rl.curricula.outcome_model.calibration`.
         """
         shown, self._shown = self._shown, {}
+        if self._proposed is not None:
+            shown["levels"] = some_of_each(*self._proposed)
+            self._proposed = None
         if self._seen:
             predicted, success = (torch.cat(one, 1) for one in zip(*self._seen, strict=True))
             shown |= calibration(predicted, success)
@@ -187,8 +204,7 @@ class AdaptiveMixture(Curriculum):
         self._beliefs = list(made)
         self._sums = self._sums.new_zeros(students, *self._sums.shape[1:])
         self._best = self._best.new_zeros(students)
-        ends = torch.tensor([[torch.inf], [-torch.inf]], dtype=torch.float64)
-        self._range = ends.expand(2, students)
+        self._ends = self._ends.new_zeros(2, students, 0)
 
     def _take_in(self) -> None:
         """Learns from the outcomes since the last proposal."""
@@ -220,12 +236,13 @@ class AdaptiveMixture(Curriculum):
 
     def _labels(self, returns: Tensor, success: Tensor | None) -> tuple[Tensor, Tensor]:
         """Returns what counts as success on levels, and what the belief learns, float64 [K, m]."""
-        extremes = torch.stack([returns.amin(1), -returns.amax(1)])
-        sign = torch.tensor([[1.0], [-1.0]], dtype=torch.float64)
-        self._range = sign * torch.minimum(sign * self._range, extremes)
-        low, high = self._range.unsqueeze(-1)
+        self._number += returns.shape[1]
+        ends = torch.cat([self._ends, torch.stack([returns, -returns])], -1).sort(-1).values
+        self._ends = ends[..., : MOST_OUTLIERS + 1]
+        place = min(self._number // OUTLIERS, MOST_OUTLIERS)
+        low, high = ends[0, :, place, None], -ends[1, :, place, None]
         wide = high - low > EQUAL * torch.maximum(high.abs(), low.abs())
-        grades = torch.where(wide, (returns - low) / (high - low), 0.5)
+        grades = torch.where(wide, (returns - low) / (high - low), 0.5).clamp(0, 1)
         self._told = self._told or success is not None
         if success is None:
             return grades, grades
@@ -283,14 +300,17 @@ class AdaptiveMixture(Curriculum):
         """Returns levels [n] that are mastered, and near to the target."""
         goal = self._space if self._target is None else self._target
         targets = goal.sample(count, draw)
-        times = self._times * (ITEMS_TIMES if hasattr(self._space, "items") else 1)
+        times = self._times * (ITEMS_TIMES if self._is_data else 1)
         levels = self._candidates(k, times * count, targets, draw)
         goals, x, items = self._inputs(targets), self._inputs(levels), self._items(levels)
         belief = self._beliefs[k]
-        # What comes back is explored by draws, which differ where little or nothing new is known.
-        p = belief.predict(x) if items is None else belief.draw(x, items, draw)
+        # Items are explored by draws, which differ where little is known, or nothing new.
+        if items is None or not self._is_data:
+            p = belief.predict(x, items)
+        else:
+            p = belief.draw(x, items, draw)
         allowed = p >= p.topk(count).values[-1].clamp(max=self._delta)
-        bonus = LEARNABLE if items is None else ITEMS_LEARNABLE
+        bonus = ITEMS_LEARNABLE if self._is_data else LEARNABLE
         extra = torch.where(allowed, -bonus * 4 * p * (1 - p), FORBIDDEN)
         chosen = []
         for start in range(0, count, AT_ONCE):
@@ -304,7 +324,7 @@ class AdaptiveMixture(Curriculum):
     def _candidates(self, k: int, count: int, targets: Levels, draw: torch.Generator) -> Levels:
         """Returns levels [n] of the space and, if it can tell, between the last way and targets."""
         space: Any = self._space
-        if hasattr(space, "items"):  # none twice, where there are enough
+        if self._is_data:  # none twice, where there are enough
             order = torch.randperm(space.size, generator=draw)
             places = order.repeat(-(-count // space.size))[:count]
             made: Levels = space.generate(places[None], [draw])[0]
@@ -318,14 +338,6 @@ class AdaptiveMixture(Curriculum):
         b = targets[torch.randint(len(targets), (half,), generator=draw)]
         every = torch.cat([fresh, space.between(a, b, NEAR, draw)])
         return every[torch.randperm(count, generator=draw)]
-
-    def _show(self, levels: Levels, arms: Tensor) -> None:
-        """Keeps some levels [n] of each arm for readers."""
-        self._shown["levels"] = {
-            arm: levels[(arms == i).nonzero().flatten()[:SHOWN]]
-            for i, arm in enumerate(ARMS)
-            if (arms == i).any()
-        }
 
     def _inputs(self, levels: Levels) -> Tensor:
         known = self._known(levels).double().cpu()
@@ -341,6 +353,15 @@ class AdaptiveMixture(Curriculum):
 
 def _each(items: Tensor | None, students: int) -> Sequence[Tensor | None]:
     return [None] * students if items is None else list(items)
+
+
+def some_of_each(levels: Levels, arms: Tensor) -> dict[str, Levels]:
+    """Returns the first few of levels [n] of each arm, for readers."""
+    return {
+        arm: levels[(arms == i).nonzero().flatten()[:SHOWN]]
+        for i, arm in enumerate(ARMS)
+        if (arms == i).any()
+    }
 
 
 def assigned(costs: Tensor) -> Tensor:

@@ -9,8 +9,13 @@ for Large-Scale Kernel Machines", NeurIPS), and for levels that come back one by
 items of a data set, what is item i's own, u_i. Both have normal distributions. A batch moves them
 to the maximum of their posterior, by Newton's method, with the curvature there as the new precision
 (Laplace's approximation, one batch after another: Spiegelhalter and Lauritzen 1990, "Sequential
-updating of conditional probabilities on directed graphical structures", Networks 20). Its cost is
-linear in the levels of the batch, and nothing is kept of earlier ones.
+updating of conditional probabilities on directed graphical structures", Networks 20). A group of G
+episodes counts as G. Its cost is linear in the levels of the batch, and nothing is kept of earlier
+ones.
+
+Both are moved together: with v the variance of u_i, w = G p (1 - p) and g = G (p - label), u_i is
+eliminated from Newton's equations, which leaves the weight w / (1 + v w) for beta and the slope
+g - w (v g + u_i - before) / (1 + v w), so that many answers to one item say little of the others.
 
 The student moves. At every batch, with lambda = 2 ** (-1 / half_life), what was known fades towards
 the prior, precision P and P beta alike:
@@ -20,6 +25,14 @@ the prior, precision P and P beta alike:
 so that a level that is ``age`` batches old has the weight 2 ** (-age / half_life). The second
 column is minus a level's age in half-lives, 0 now: a trend. Growing older by a batch is a linear
 map A of the columns, so that first beta <- A^-T beta and P <- A P A^T.
+
+What is an item's own goes back to what is expected of it, the log odds of a pass rate or 0, with a
+half-life LASTING times as long, and its variance to V, that among items:
+
+    u <- e + mu (u - e),      v <- V + mu^2 (v - V),      mu = 2 ** (-1 / (LASTING half_life)),
+
+and V moves by a step of expectation-maximization at every batch, towards the mean of
+(u - e)^2 + v of its items.
 
 The expectation of success is that of MacKay 1992, "The evidence framework applied to classification
 networks" (Neural Computation 4): with s^2 the variance of z,
@@ -31,6 +44,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -46,7 +60,7 @@ WIDEST = 24  # inputs; more are projected to as many
 STEPS, CLOSE = 12, 1e-4  # of Newton's method, and the change of log odds at which it ends
 LEAP = 3.0  # of log odds in one of its steps, at most
 SURE = 1e-3  # least curvature that an episode adds, p (1 - p)
-REMEMBERED = "mean", "precision", "own", "doubt", "apart"
+REMEMBERED = "mean", "precision", "own", "unknown", "apart"
 
 
 class Belief:
@@ -55,6 +69,8 @@ class Belief:
     Args:
         inputs: numbers D that are known of a level.
         items: number N of levels that come back, each with a memory of its own; 0 for none.
+        expected: log odds of success that are an item's own before anything is seen, float64 [N];
+            None for 0.
         half_life: batches after which a level counts half.
         ridge: prior precision of coefficients.
     """
@@ -89,7 +105,7 @@ class Belief:
         self._apart = torch.tensor(OWN, dtype=torch.float64)  # the variance among items
         self._expected = torch.zeros(items, dtype=torch.float64) if expected is None else expected
         self._own = self._expected
-        self._doubt = torch.full_like(self._own, OWN)  # the variance of that
+        self._unknown = torch.ones_like(self._own)  # the part of that variance which is left
         self._covariance: Tensor | None = None
 
     def grow_older(self, batches: float = 1.0) -> None:
@@ -103,7 +119,7 @@ class Belief:
         self._mean = torch.linalg.solve(self._precision, old * (precision @ (back @ self._mean)))
         left = 0.5 ** (age / LASTING)
         self._own = self._expected + left * (self._own - self._expected)
-        self._doubt = self._apart + left**2 * (self._doubt - self._apart)
+        self._unknown = 1 - left**2 * (1 - self._unknown)
         self._covariance = None
 
     def observe(
@@ -128,10 +144,11 @@ class Belief:
             items, row = items.unique(return_inverse=True)
             none = torch.zeros(len(items), dtype=torch.float64)
             won, counts = (none.index_add(0, row, one) for one in (counts * labels, counts))
-            labels, inputs = won / counts, inputs.new_empty(len(items), inputs.shape[1]).index_copy(
-                0, row, inputs
+            labels, inputs = (
+                won / counts,
+                inputs.new_empty(len(items), inputs.shape[1]).index_copy(0, row, inputs),
             )
-            own, doubt = self._own[items], self._doubt[items]
+            own, doubt = self._own[items], self._apart * self._unknown[items]
         phi, prior, precision = self._columns(inputs), self._mean, self._precision
         z, mean, u = phi @ prior, prior, own
         for _ in range(STEPS):
@@ -153,8 +170,11 @@ class Belief:
         self._precision = precision + _curvature(phi, bend / (1 + bend * doubt))
         if items is not None:
             self._own = self._own.index_copy(0, items, u)
-            self._doubt = self._doubt.index_copy(0, items, doubt / (1 + bend * doubt))
-            self._tell_apart(items)
+            left = self._unknown[items] / (1 + bend * doubt)
+            self._unknown = self._unknown.index_copy(0, items, left)
+            square = (u - self._expected[items]).square() + self._apart * left
+            moved = (square - self._apart).sum() / (STEADY + len(items))  # a step of EM
+            self._apart = self._apart + moved
 
     def predict(self, inputs: Tensor, items: Tensor | None = None) -> Tensor:
         """Returns the probability of success on levels, float64 [n].
@@ -168,7 +188,7 @@ class Belief:
         phi = self._columns(inputs)
         z, variance = phi @ self._mean, ((phi @ self._covariance) * phi).sum(-1)
         if items is not None:
-            z, variance = z + self._own[items], variance + self._doubt[items]
+            z, variance = z + self._own[items], variance + self._apart * self._unknown[items]
         return (z / (1 + math.pi / 8 * variance).sqrt()).sigmoid()
 
     def draw(self, inputs: Tensor, items: Tensor, generator: torch.Generator) -> Tensor:
@@ -181,11 +201,12 @@ class Belief:
             items: likewise.
             generator: of the CPU.
         """
-        size, kind = len(self._mean), {"generator": generator, "dtype": torch.float64}
-        noise = torch.randn(size, 1, **kind)
-        factor = torch.linalg.cholesky(self._precision)
-        mean = self._mean + torch.linalg.solve_triangular(factor.mT, noise, upper=True)[:, 0]
-        own = self._own[items] + self._doubt[items].sqrt() * torch.randn(len(items), **kind)
+        normal = partial(torch.randn, generator=generator, dtype=torch.float64)
+        factor = torch.linalg.cholesky(self._precision).mT
+        noise = torch.linalg.solve_triangular(factor, normal(len(factor), 1), upper=True)
+        mean = self._mean + noise[:, 0]
+        doubt = self._apart * self._unknown[items]
+        own = self._own[items] + doubt.sqrt() * normal(len(items))
         return (self._columns(inputs) @ mean + own).sigmoid()
 
     def state_dict(self) -> dict[str, Any]:
@@ -197,12 +218,6 @@ class Belief:
         for name in REMEMBERED:
             setattr(self, f"_{name}", state[name])
         self._covariance = None
-
-    def _tell_apart(self, items: Tensor) -> None:
-        """Moves the variance among items towards that of some, by a step of EM."""
-        square = (self._own - self._expected)[items].square() + self._doubt[items]
-        moved = (square - self._apart).sum() / (STEADY + len(items))
-        self._apart = self._apart + moved
 
     def _columns(self, inputs: Tensor) -> Tensor:
         """Returns the columns of inputs [n, D]: [n, F]."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -38,10 +39,28 @@ class Bins:
         """Returns the value that stands for each part."""
         return ((self.low + self.high) / 2).tolist() if self.wide else self.low.tolist()
 
-    @property
+    @cached_property
     def wide(self) -> bool:
         """Returns whether the parts are more than single values."""
         return bool((self.high > self.low).any())
+
+    @cached_property
+    def ends(self) -> tuple[Number, Number]:
+        """Returns the lowest and the highest value of all parts."""
+        return self.low[0].item(), self.high[-1].item()
+
+    @cached_property
+    def borders(self) -> Tensor:
+        """Returns where each part but the last ends, and the next begins, float64 [n - 1]."""
+        return (self.high[:-1] + self.low[1:]).double() / 2
+
+    @cached_property
+    def scale(self) -> tuple[float, float]:
+        """Returns the value that lies at -1, and how far from it the one at 1 lies."""
+        ends = (self.low + self.high).double() / 2
+        if len(ends) == 1:
+            ends = torch.cat([self.low, self.high]).double()
+        return float(ends[0]), float(ends[-1] - ends[0])
 
     def draw(self, index: Tensor, generator: torch.Generator) -> Tensor:
         """Draws a value of each of the parts int64 [P]: [P]."""
@@ -93,7 +112,7 @@ class Bins:
             last = len(self.low) - 1
             place = start.lerp(end, share) + noise * last
             return self.low[place.round().long().clamp(0, last)]
-        low, high = self.low[0], self.high[-1]
+        low, high = self.ends
         value = a.double().lerp(b.double(), share) + noise * (high - low)
         return (value if self.low.is_floating_point() else value.round()).to(a).clamp(low, high)
 
@@ -102,15 +121,17 @@ class Bins:
 
         If there is one part alone, -1 and 1 are its ends; a single value lies at 0.
         """
-        ends = (self.low + self.high).double() / 2
-        if len(ends) == 1:
-            ends = torch.cat([self.low, self.high]).double()
-        first, reach = ends[0], ends[-1] - ends[0]
+        first, reach = self.scale
         return 2 * (values - first) / reach - 1 if reach > 0 else 0 * values
 
-    def columns(self, values: Tensor) -> Tensor:
-        """Returns what a belief knows of values [*B], numbers of -1 to 1: float64 [*B, c]."""
-        return self.scaled(values.double()).unsqueeze(-1)
+    def columns(self, values: Tensor, scaled: Tensor) -> Tensor:
+        """Returns what a belief knows of values [*B], numbers of -1 to 1: float64 [*B, c].
+
+        Args:
+            values: on the CPU.
+            scaled: where they lie, see :meth:`scaled`.
+        """
+        return scaled.unsqueeze(-1)
 
     def below(self, ends: Tensor) -> Tensor:
         """Returns the probability of a value of at most each of some ends, float64 [n]."""
@@ -127,7 +148,7 @@ class Bins:
         What lies beyond the first or the last part, or between single values, counts for the
         nearest part.
         """
-        ends = of.below((self.high[:-1] + self.low[1:]) / 2)
+        ends = of.below(self.borders)
         return torch.cat([torch.zeros(1), ends, torch.ones(1)]).diff()
 
     def __str__(self) -> str:
@@ -223,6 +244,8 @@ class ParameterSpace:
         self.bins, self._seeded, self._seeds = dict(bins), seeded, seeds
         self._device = torch.device(device)
         self.axes = {name: part.middles for name, part in self.bins.items()}
+        scales = [part.scale for part in self.bins.values()]
+        self._scales = torch.tensor(scales, dtype=torch.float64).reshape(-1, 2).mT
         self.size = math.prod(len(values) for values in self.axes.values())
         if self.size > MOST_COMBINATIONS:
             raise ValueError(
@@ -243,13 +266,22 @@ class ParameterSpace:
 
         Along an axis of one bin that goes from -1 to 1.
         """
-        lines = [part.scaled(levels[name].cpu().double()) for name, part in self.bins.items()]
-        return torch.stack(lines, -1).float() if lines else torch.zeros(*levels.batch_size, 0)
+        return self._scaled(levels).float()
 
     def inputs(self, levels: TensorDictBase) -> Tensor:
         """Returns what a belief knows of levels [*B]: float64 [*B, D] on the CPU."""
-        known = [part.columns(levels[name].cpu()) for name, part in self.bins.items()]
-        return torch.cat(known, -1) if known else torch.zeros(*levels.batch_size, 0).double()
+        where = self._scaled(levels)
+        places = zip(self.bins.items(), where.unbind(-1), strict=True)
+        known = [part.columns(levels[name].cpu(), own) for (name, part), own in places]
+        return torch.cat(known, -1) if known else where
+
+    def _scaled(self, levels: TensorDictBase) -> Tensor:
+        """Returns where levels [*B] lie along each axis, float64 [*B, D] on the CPU."""
+        if not self.bins:
+            return torch.zeros(*levels.batch_size, 0, dtype=torch.float64)
+        values = torch.stack([levels[name].double() for name in self.bins], -1).cpu()
+        first, reach = self._scales
+        return torch.where(reach > 0, 2 * (values - first) / reach - 1, 0 * values)
 
     def items(self, levels: TensorDictBase) -> Tensor | None:
         """Returns the bins of levels [*B] that are single values, int64 [*B] on the CPU, or None.
@@ -280,13 +312,19 @@ class ParameterSpace:
         return shares.float()
 
     def _draw(self, choices: Tensor, generator: torch.Generator) -> TensorDict:
-        places = torch.unravel_index(choices, [len(values) for values in self.axes.values()])
-        level = {
-            name: part.draw(place, generator)
-            for (name, part), place in zip(self.bins.items(), places, strict=True)
-        }
+        places = self._unravelled(choices)
+        level = {name: part.draw(places[name], generator) for name, part in self.bins.items()}
         seeds = self._drawn_seeds(choices.shape, generator)
         return TensorDict({**level, **seeds}, choices.shape, device=self._device)
+
+    def _unravelled(self, choices: Tensor) -> dict[str, Tensor]:
+        """Returns the place of combinations int64 [P] along each axis, by its name: int64 [P]."""
+        places, nothing = {}, torch.zeros_like(choices)
+        for name, values in reversed(self.axes.items()):  # the last runs fastest
+            size = len(values)
+            places[name] = choices % size if size > 1 else nothing
+            choices = choices // size if size > 1 else choices
+        return places
 
     def at(self, points: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
         """Returns levels [K, P] at points of the box [-1, 1]^D that the whole ranges span.

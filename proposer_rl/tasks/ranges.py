@@ -102,7 +102,7 @@ class Labelled(Bins):
         """Returns one of two choices each: b in so many of all draws as the share says."""
         return torch.where(share < 0.5, a, b)
 
-    def columns(self, values: Tensor) -> Tensor:
+    def columns(self, values: Tensor, scaled: Tensor) -> Tensor:
         """Returns whether values [*B] are each of the choices: float64 [*B, c]."""
         return one_hot(values, len(self.labels)).double()
 

@@ -8,7 +8,7 @@ from typing import Any
 from proposer_rl.curricula import Curriculum
 from proposer_rl.curricula.combinators import Combinator
 from proposer_rl.settings import ArgumentError
-from proposer_rl.task import Levels
+from proposer_rl.task import Levels, level_inputs
 
 SHOWN = 3  # differences in one line
 LONGEST = 60  # of a value in it
@@ -20,7 +20,10 @@ def of_levels(space: Any, like: Levels) -> dict[str, Any]:
         ".".join([name] if isinstance(name, str) else name): like.get(name)
         for name in like.keys(True, True)
     }
-    levels = {name: f"{one.dtype} {list(one.shape)}" for name, one in entries.items()}
+    levels: dict[str, Any] = {
+        name: f"{one.dtype} {list(one.shape)}" for name, one in entries.items()
+    }
+    levels["number of features"] = level_inputs(space.space, like.unsqueeze(0)).shape[-1]
     known = getattr(space, "description", {"kind": type(space).__qualname__})
     return {**known, "levels": levels}
 

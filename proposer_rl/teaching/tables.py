@@ -52,7 +52,7 @@ def item_table(features: Any) -> Table:
     """
     columns = _columns(features)
     texts = [_begins_with_text(column) for column in columns.values()]
-    if not columns or not any(texts) and hasattr(features, "__array__"):
+    if not columns or (not any(texts) and hasattr(features, "__array__")):
         return Table(number_table(features), None)
     if len({len(column) for column in columns.values()}) > 1:
         raise ArgumentError(f"features={[*columns]}: must have columns of one length")
@@ -113,8 +113,8 @@ def ranks(table: Tensor) -> Tensor:
     """
     columns = table.double().mT.contiguous()
     rising, order = columns.sort()
-    both = sum(torch.searchsorted(rising, rising, right=right) for right in (False, True))
-    middle = (both / len(table) - 1).float()
+    below, upto = (torch.searchsorted(rising, rising, right=right) for right in (False, True))
+    middle = ((below + upto) / len(table) - 1).float()
     return torch.empty_like(middle).scatter_(1, order, middle).mT.contiguous()
 
 

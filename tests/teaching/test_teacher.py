@@ -135,6 +135,8 @@ FREE = {  # of what needs nothing of a learner, settings that are small
     "adr": {"episodes": 2},
     "spdl": {"episodes": 8},
     "adaptive_mixture": {},
+    "mopps": {},
+    "arc_length": {},
     "model_transport": {"probes": 1},
     "mixture": {"parts": {"currot": {"probes": 1}}},
 }
@@ -174,6 +176,7 @@ def test_whoever_needs_nothing_works_from_returns_and_success(name: str, space: 
         settings = {"distributions": ["id", "id"], "until": [2]}
     recipe = getattr(prl.curricula, name)(**settings)
     bins = {"alp_gmm", "adr", "spdl", "learning_progress", "model_transport", "mixture"}
+    bins |= {"mopps", "arc_length"}
     if space == "a generator" and name in bins:
         with pytest.raises(ArgumentError, match="draws from bins"):
             prl.Teacher(recipe, SPACES[space]())
@@ -202,8 +205,10 @@ def ranges(**given: Any) -> prl.Parameters:
     return prl.Parameters(ONE, **given)
 
 
-def drawn(shape: int) -> prl.LevelGenerator:
-    return prl.LevelGenerator(lambda n, g: torch.rand(n, shape, generator=g))
+def drawn(shape: int, known: int = 0) -> prl.LevelGenerator:
+    return prl.LevelGenerator(
+        lambda n, g: torch.rand(n, shape, generator=g), features=lambda levels: levels[:, :known]
+    )
 
 
 GROUND = ["flat", "stairs", "gap"]
@@ -218,6 +223,7 @@ OTHERS: dict[str, tuple[Any, Any, str]] = {
     "a bit smaller": (ranges(), prl.Parameters({"slope": (0.0, 7.9999999)}), "is 0 to 7.9999999"),
     "fewer items": (ITEMS, prl.Items(10), "count was 100, is 10"),
     "other features": (ITEMS, prl.Items(100, features=torch.eye(100)), "feat"),
+    "pass rates": (ITEMS, prl.Items(100, pass_rates=[0.5] * 100), "pass_rates was missing"),
     "another target": (prl.Items(9, target=[1]), prl.Items(9, target=[2]), r"was \[1\], is \[2\]"),
     "no target": (ranges(target={"slope": 8}), ranges(), "target.slope was .8.*, is missing"),
     "another name": (
@@ -233,6 +239,11 @@ OTHERS: dict[str, tuple[Any, Any, str]] = {
     "other bins": (ranges(), ranges(bins=4), "bins.slope was 8, is 4"),
     "seeds": (ranges(), ranges(seeded=True), "seeded was False, is True"),
     "a shape": (drawn(3), drawn(4), r"level was torch.float32 \[3\], is torch.float32 \[4\]"),
+    "features": (*(drawn(3, known) for known in (2, 3)), "levels.number of features was 2, is 3$"),
+    "features of places": (
+        *(prl.Items(4, features=known) for known in (None, torch.arange(4.0)[:, None])),
+        "levels.number of features was 0, is 1$",
+    ),
     "a task": (drawn(3), TASK, "kind was LevelGenerator, is "),
 }
 
@@ -314,6 +325,30 @@ def test_a_log_counts_what_went_out_and_came_back(name: str, space: str, tmp_pat
     written = [json.loads(line) for line in file.read_text().splitlines()]
     assert written == [{k: v for k, v in one.items() if k != "levels"} for one in (log, empty)]
     assert same(plain(teacher.ask(20)[1]), plain(silent.ask(20)[1]))
+
+
+def test_parameters_are_counted_and_known_each_by_bins_of_its_own() -> None:
+    """Against Python's own arithmetic, value by value."""
+    lines = {"a": (0.0, 1.0), "n": range(12), "c": [1, 2, 5, 9], "ground": GROUND, "one": [-3.5]}
+    space = prl.Parameters(lines, bins={"a": 3, "n": 4})
+    teacher = prl.Teacher("domain_randomization", space, students=2)
+    levels = teacher.propose(100)
+    rows = [row for own in levels for row in space.rows(own)]
+    assert {name: [*bins.values()] for name, bins in teacher.log()["drawn"].items()} == {
+        "a": [sum(int(3 * row["a"]) == i for row in rows) for i in range(3)],
+        "n": [sum(row["n"] // 3 == i for row in rows) for i in range(4)],
+        "c": [sum(row["c"] == value for row in rows) for value in (1, 2, 5, 9)],
+        "ground": [sum(row["ground"] == text for row in rows) for text in GROUND],
+        "one": [200],
+    }
+    expected = [
+        [3 * row["a"] - 1.5, (row["n"] - 1) / 4.5 - 1, (row["c"] - 1) / 4 - 1]
+        + [row["ground"] == text for text in GROUND]
+        + [0]
+        for row in rows
+    ]
+    known = torch.tensor(expected, dtype=torch.float64)
+    torch.testing.assert_close(space.inputs(levels), known.reshape(2, 100, -1))
 
 
 def hills(values: Any, generator: torch.Generator) -> torch.Tensor:
