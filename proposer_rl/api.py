@@ -53,6 +53,7 @@ from proposer_rl.teaching import (
     TaughtEnv,
     Teacher,
     TeacherSampler,
+    mixed_groups,
 )
 
 if TYPE_CHECKING:
@@ -110,6 +111,7 @@ __all__ = [
     "curricula",
     "generate_levels",
     "log_success_gain",
+    "mixed_groups",
     "outcome_of",
     "performance_gain",
     "shortest_path_length",

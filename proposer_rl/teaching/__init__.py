@@ -4,6 +4,7 @@ from proposer_rl.teaching.abilities import ActorStudent as ActorStudent
 from proposer_rl.teaching.gymnasium import TaughtEnv as TaughtEnv
 from proposer_rl.teaching.remote import TeacherClient as TeacherClient
 from proposer_rl.teaching.sampler import TeacherSampler as TeacherSampler
+from proposer_rl.teaching.sampler import mixed_groups as mixed_groups
 from proposer_rl.teaching.spaces import Items as Items
 from proposer_rl.teaching.spaces import LevelGenerator as LevelGenerator
 from proposer_rl.teaching.spaces import LevelSpace as LevelSpace

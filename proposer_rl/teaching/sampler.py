@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 from itertools import chain
 from math import inf, isfinite
 from operator import index
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 from zlib import crc32
 
-from torch import distributed
+import torch
+from torch import Tensor, distributed
 from torch.utils.data import Sampler
 
 from proposer_rl.settings import ArgumentError, Count, checked
@@ -21,9 +22,15 @@ from proposer_rl.teaching.teacher import Teacher
 
 T = TypeVar("T")
 
-Answer = tuple[float, float] | None
-"""Success and return of an answer to an item; None if nothing came of it."""
 FEW = 32  # items of which it is too early to say that most are missing
+
+
+class Answer(NamedTuple):
+    """What came of an item: the success and return of an answer, or means of several."""
+
+    success: float
+    return_: float
+    episodes: float = 1
 
 
 @dataclass
@@ -54,9 +61,10 @@ class TeacherSampler(Sampler[int]):
         repeat: how many times each comes, one after another, as groups of answers to one prompt.
         group: items that are repeated together before they come again; with ``rounds``.
         rounds: how many times each group comes over again.
+        sources: where each item is from, [N], by which :meth:`metrics` are given, too.
 
     Raises:
-        ArgumentError: if the teacher's levels are no items.
+        ArgumentError: if the teacher's levels are no items, or not each has a source.
     """
 
     @checked
@@ -68,16 +76,23 @@ class TeacherSampler(Sampler[int]):
         repeat: Count = 1,
         group: Count = 1,
         rounds: Count = 1,
+        sources: Any = None,
     ) -> None:
         if not isinstance(teacher.space, Items):
             raise ArgumentError("teacher: must have a space of Items")
+        if sources is not None and len(sources) != teacher.space.size:
+            raise ArgumentError(f"sources: {len(sources)} for {teacher.space.size} items")
         self._teacher, self._length = teacher, length
         self._repeat, self._group, self._rounds = repeat, group, rounds
         self._out: dict[int, list[int]] = defaultdict(list)  # tickets of each item
-        self._came: dict[int, list[Answer]] = {}  # answers to items of which more are to come
+        self._came: dict[
+            int, list[Answer | None]
+        ] = {}  # answers to items of which more are to come
         self._epoch, self._goes_on = Epoch(), False  # whether the next one is the rest of it
         self._asked, self._trace = 0, 0  # how many items since the start, and a checksum of them
         self._check: float = 0  # how many there must be for the next look at what is missing
+        self._sources = sources
+        self._sums: dict[str, list[float]] = {}  # since the last metrics, of all and by source
 
     def __len__(self) -> int:
         return self._length * self._repeat * self._rounds
@@ -104,19 +119,22 @@ class TeacherSampler(Sampler[int]):
         """
         self._epoch.place, self._goes_on = 0, True
 
-    def tell(self, items: Sequence[int], success: Any, return_: Any = None) -> None:
+    def tell(
+        self, items: Sequence[int], success: Any, return_: Any = None, *, episodes: Any = None
+    ) -> None:
         """Reports results of items; each counts when its last answer is there.
 
         Args:
             items: as they were drawn, with their repetitions, in any order, [n].
             success: of each answer, from 0 to 1; None for one of which nothing came, [n].
             return_: of each; None for the success.
+            episodes: how many answers each is the mean of, where ``repeat`` is 1; None for one.
 
         Raises:
             ArgumentError: for an item of which not so many answers are out, or another number of
                 results; none of them counts then, on any rank.
         """
-        self._count(lambda: _answers(items, success, return_))
+        self._count(lambda: _answers(items, success, return_, episodes))
 
     def drop(self, items: Sequence[int] | None = None) -> None:
         """Gives up items of which no results will come.
@@ -132,6 +150,22 @@ class TeacherSampler(Sampler[int]):
             self._epoch, self._goes_on = Epoch(), False
         else:
             self._count(lambda: [(item, None) for item in _whole(items)])
+
+    def metrics(self) -> dict[str, float]:
+        """Returns means over the groups that were complete since the last call.
+
+        ``success``; what the curriculum had ``predicted`` of it, if it has a belief; ``yield``, the
+        share of groups whose answers differ; ``no_variance``, that of all others; and the same by
+        source, as ``yield/SOURCE``. Nothing, if there was no group.
+        """
+        shown: dict[str, float] = {}
+        for of, (groups, success, mixed, predicted, known) in self._sums.items():
+            shown |= {f"success{of}": success / groups, f"yield{of}": mixed / groups}
+            shown[f"no_variance{of}"] = 1 - mixed / groups
+            if known:
+                shown[f"predicted{of}"] = predicted / known
+        self._sums = {}
+        return shown
 
     def state_dict(self) -> dict[str, Any]:
         """Returns what is out, and the place in the epoch; the teacher has a state of its own."""
@@ -157,9 +191,10 @@ class TeacherSampler(Sampler[int]):
         self._out = defaultdict(list)  # JSON has made texts of the items
         self._out.update({int(item): list(tickets) for item, tickets in state["out"].items()})
         self._came = {
-            int(item): [answer and (answer[0], answer[1]) for answer in answers]
+            int(item): [answer and Answer(*answer) for answer in answers]
             for item, answers in state["came"].items()
         }
+        self._forget()
         self._epoch = Epoch(list(state["drawn"]), state["place"])
         self._goes_on = bool(self._epoch.drawn)
         self._asked, self._trace, self._check = sum(map(len, self._out.values())), 0, 0
@@ -171,12 +206,21 @@ class TeacherSampler(Sampler[int]):
         self._trace = crc32(b"%d " % item, self._trace)
         return int(item)
 
-    def _count(self, read: Callable[[], list[tuple[int, Answer]]]) -> None:
+    def _forget(self) -> None:
+        """Forgets what the teacher has done with, as a loader's state may be older than its own."""
+        for item, tickets in self._out.items():
+            done = self._teacher.done_with(tickets)
+            if done.any():
+                tickets[:] = [t for t, over in zip(tickets, done, strict=True) if not over]
+                self._came.pop(item, None)
+
+    def _count(self, read: Callable[[], list[tuple[int, Answer | None]]]) -> None:
         """Counts answers, and gives the teacher the results of items whose last answer came."""
-        came: dict[int, list[Answer]] = {}
+        came: dict[int, list[Answer | None]] = {}
         for item, answer in _everywhere(read, self._trace):
             came.setdefault(item, list(self._came.get(item, ()))).append(answer)
-        whole: list[tuple[int, float, float, int]] = []
+        whole: list[tuple[int, float, float, float]] = []
+        groups: list[tuple[int, list[Answer]]] = []  # the answers of each of them
         dropped: list[int] = []
         over: list[tuple[int, int]] = []  # items, and how many of their tickets
         for item, answers in came.items():
@@ -187,15 +231,22 @@ class TeacherSampler(Sampler[int]):
             full = len(answers) // self._repeat
             for ticket in tickets[:full]:
                 group, answers[:] = answers[: self._repeat], answers[self._repeat :]
-                if results := [answer for answer in group if answer]:
-                    success, return_ = (sum(n) / len(n) for n in zip(*results, strict=True))
-                    whole.append((ticket, return_, success, len(results)))
+                if results := [Answer(*answer) for answer in group if answer]:
+                    episodes = sum(one.episodes for one in results)
+                    return_ = sum(one.return_ * one.episodes for one in results) / episodes
+                    success = sum(one.success * one.episodes for one in results) / episodes
+                    whole.append((ticket, return_, success, episodes))
+                    groups.append((item, results))
                 else:
                     dropped.append(ticket)
             over.append((item, full))
         if whole:
-            ids, returns, successes, episodes = zip(*whole, strict=True)
-            self._teacher.tell([*ids], returns, successes, episodes=episodes)
+            ids, returns, successes, counts = zip(*whole, strict=True)
+            predicted = self._teacher.predicted([*ids])
+            self._teacher.tell([*ids], returns, successes, episodes=counts)
+            for place, (item, results) in enumerate(groups):
+                expected = None if predicted is None else float(predicted[place])
+                self._sum(item, successes[place], results, expected)
         self._teacher.drop(dropped)
         for item, full in over:
             del self._out[item][:full]
@@ -203,6 +254,18 @@ class TeacherSampler(Sampler[int]):
         for item in [item for item in came if not came[item]]:
             del self._came[item]
         self._look()
+
+    def _sum(
+        self, item: int, success: float, results: list[Answer], predicted: float | None
+    ) -> None:
+        """Adds a group to the metrics."""
+        seen = {one.success for one in results}
+        mixed = len(seen) > 1 or any(one.episodes > 1 and 0 < one.success < 1 for one in results)
+        known = predicted is not None
+        for of in [""] if self._sources is None else ["", f"/{self._sources[item]}"]:
+            sums = self._sums.setdefault(of, [0.0] * 5)
+            for place, value in enumerate((1, success, mixed, predicted or 0, known)):
+                sums[place] += value
 
     def _look(self) -> None:
         """Warns, once, if results of most items never come, when few can still be on their way."""
@@ -219,6 +282,74 @@ class TeacherSampler(Sampler[int]):
                 "rounds must be the loop's, and torch.distributed initialized on all ranks",
                 stacklevel=4,
             )
+
+
+class MixedGroups(NamedTuple):
+    """Groups whose answers differ, and what they have cost.
+
+    Attributes:
+        items: of the groups, [m].
+        success: of their answers, float64 [m, G].
+        places: of the groups among all that were generated, one call after another, int64 [m].
+        rollouts: answers that were generated, those of groups that were thrown away among them.
+    """
+
+    items: list[int]
+    success: Tensor
+    places: Tensor
+    rollouts: int
+
+
+@checked
+def mixed_groups(
+    teacher: Teacher, count: Count, generate: Callable[[list[int]], Any], *, most: Count = 10
+) -> MixedGroups:
+    """Draws items until enough groups of answers are mixed, as in DAPO's dynamic sampling.
+
+    GRPO learns nothing from a group whose answers are all alike. The teacher draws another item in
+    its place; its result counts for the curriculum like all others.
+
+    Args:
+        teacher: of :class:`Items`, with a ``block`` of about ``count``.
+        count: how many groups are to be mixed.
+        generate: of items [n] the success of G answers to each, from 0 to 1, [n, G].
+        most: calls of it, after which there may be fewer groups.
+
+    Raises:
+        ArgumentError: if its results are no such numbers, whose items are dropped then; if the
+            teacher's levels are no items.
+    """
+    if not isinstance(teacher.space, Items):
+        raise ArgumentError("teacher: must have a space of Items")
+    drawn: list[int] = []
+    groups: list[Tensor] = []
+    places: list[int] = []
+    rollouts = 0
+    for _ in range(most):
+        tickets, items = teacher.ask(count - len(places))
+        try:
+            success = torch.as_tensor(generate(items.tolist())).double().cpu()
+            if success.ndim != 2 or len(success) != len(items):
+                shape = list(success.shape)
+                raise ArgumentError(f"generate={shape}: must give results [{len(items)}, G]")
+            if not ((success >= 0) & (success <= 1)).all():
+                raise ArgumentError("generate: must give results from 0 to 1")
+            means = success.mean(1)
+            teacher.tell(tickets, means, means, episodes=success.shape[1])
+        except BaseException:
+            teacher.drop(tickets)
+            raise
+        mixed = (success != success[:, :1]).any(1).nonzero().flatten()
+        places += (mixed + len(drawn)).tolist()
+        drawn += items.tolist()
+        groups.append(success)
+        rollouts += success.numel()
+        if len(places) == count:
+            break
+    chosen = torch.tensor(places, dtype=torch.int64)
+    return MixedGroups(
+        [drawn[place] for place in places], torch.cat(groups)[chosen], chosen, rollouts
+    )
 
 
 def _everywhere(read: Callable[[], list[T]], trace: int) -> list[T]:
@@ -243,15 +374,18 @@ def _everywhere(read: Callable[[], list[T]], trace: int) -> list[T]:
     return [answer for _, _, answers in said for answer in answers]
 
 
-def _answers(items: Any, success: Any, return_: Any) -> list[tuple[int, Answer]]:
+def _answers(
+    items: Any, success: Any, return_: Any, episodes: Any
+) -> list[tuple[int, Answer | None]]:
     """Returns the answers to items [n], each with its item."""
     numbers, shares = _whole(items), _numbers("success", success)
     returns = shares if return_ is None else _numbers("return_", return_)
-    for name, values in (("success", shares), ("return_", returns)):
+    counts = [1.0] * len(numbers) if episodes is None else _numbers("episodes", episodes)
+    for name, values in (("success", shares), ("return_", returns), ("episodes", counts)):
         if len(values) != len(numbers):
             raise ArgumentError(f"{name}: {len(values)} results for {len(numbers)} items")
-    answers: list[tuple[int, Answer]] = []
-    for item, share, number in zip(numbers, shares, returns, strict=True):
+    answers: list[tuple[int, Answer | None]] = []
+    for item, share, number, count in zip(numbers, shares, returns, counts, strict=True):
         if share is None:
             answers.append((item, None))
             continue
@@ -259,7 +393,9 @@ def _answers(items: Any, success: Any, return_: Any) -> list[tuple[int, Answer]]
             raise ArgumentError(f"success={share:g}: must be from 0 to 1")
         if number is None or not isfinite(number):
             raise ArgumentError(f"return_={number}: must be finite")
-        answers.append((item, (share, number)))
+        if count is None or not (count >= 1 and count == int(count)):
+            raise ArgumentError(f"episodes={count}: must be a whole number from 1")
+        answers.append((item, Answer(share, number, count)))
     return answers
 
 

@@ -19,7 +19,7 @@ from torch.utils._pytree import tree_map_only
 
 from proposer_rl.curricula import Curriculum, Student, require
 from proposer_rl.curricula.batches import CPU, moved, packed
-from proposer_rl.curricula.ledger import OUT, OVER, Block, Ledger
+from proposer_rl.curricula.ledger import OUT, OVER, RETURNED, Block, Ledger
 from proposer_rl.models import own_state
 from proposer_rl.recipes import Recipe
 from proposer_rl.runs.folder import storage
@@ -233,6 +233,32 @@ class Teacher:
                 self._tally.returned(1, numbers["return"], numbers.get("success"))
             else:
                 self._tell(as_ids(ids), results)
+
+    def predicted(self, ids: Any) -> NDArray[np.float64] | None:
+        """Returns the success that the curriculum expected of levels when it proposed them.
+
+        Args:
+            ids: tickets [n] that are out.
+
+        Returns:
+            [n] ([K, n] of several students); None if it expects nothing.
+
+        Raises:
+            ArgumentError: for a ticket that is not out.
+        """
+        with self._here():
+            tickets = as_ids(ids)
+            found = np.full((self.students, len(tickets)), np.nan)
+            for block, which, place in self._ledger.find(tickets):
+                if "predicted" not in block.batch.notes.keys():
+                    return None
+                found[:, which] = block.batch.notes["predicted"][:, place]
+            return found[0] if self._alone else found
+
+    def done_with(self, ids: Any) -> NDArray[np.bool_]:
+        """Returns of which tickets [n] the results have been told, or that were dropped, [n]."""
+        with self._here():
+            return np.isin(self._ledger.states(as_ids(ids)), (RETURNED, OVER))
 
     def drop(self, ids: Any = None) -> None:
         """Gives up levels of which no results will come, as of episodes that were cut off.

@@ -33,11 +33,13 @@ class TaughtReward(TrainerCallback):
     Groups and their repetitions follow from the trainer's config; an epoch has as many prompts as
     the training set. Evaluation does not count. Checkpoints hold the curriculum, and
     ``train(resume_from_checkpoint=...)`` goes on with it. In a launch each rank does the same.
+    The trainer logs :meth:`TeacherSampler.metrics` as ``curriculum/...``.
 
     Args:
         teacher: of :class:`Items`, one for each row of the training set.
         reward: of completions and columns, as TRL calls it: of each how well it solves its prompt,
             from 0 to 1; None for one that does not count.
+        source: the column of the training set by which metrics are logged, too; None for none.
 
     Raises:
         ArgumentError: if the teacher's levels are no items, or the function is a coroutine.
@@ -45,14 +47,21 @@ class TaughtReward(TrainerCallback):
 
     _trainer: Any = None
     _sampler: TeacherSampler
+    _loader: Callable[[], Any]
     _loaded = False
 
-    def __init__(self, teacher: Teacher, reward: Callable[..., Sequence[float | None]]) -> None:
+    def __init__(
+        self,
+        teacher: Teacher,
+        reward: Callable[..., Sequence[float | None]],
+        source: str | None = None,
+    ) -> None:
         if not isinstance(teacher.space, Items):
             raise ArgumentError("teacher: must have a space of Items")
         if iscoroutinefunction(reward):
             raise ArgumentError("reward: must be no coroutine: ranks are told in step")
         self._teacher, self._rows, self._reward = teacher, teacher.space.size, reward
+        self._source = source
         self._told = 0  # generations
         self._again = False  # whether the next one repeats the last that was reported
         update_wrapper(self, reward)  # TRL logs it by its name
@@ -66,10 +75,20 @@ class TaughtReward(TrainerCallback):
         Raises:
             ArgumentError: naming what of the trainer does not fit.
         """
+        if self._trainer is not None:
+            raise ArgumentError("trainer: is another one; each needs a TaughtReward of its own")
+        if self not in trainer.reward_funcs:
+            raise ArgumentError("reward_funcs: must have this TaughtReward, which reports results")
         rows, config = trainer.train_dataset, trainer.args
         count = len(rows) if hasattr(rows, "__len__") else "a stream of"
         if count != self._rows:
             raise ArgumentError(f"train_dataset: has {count} rows, the teacher {self._rows} items")
+        columns = rows.column_names
+        if ROW in columns:
+            raise ArgumentError(f"train_dataset: has a column {ROW}, as of another TaughtReward")
+        if self._source is not None and self._source not in columns:
+            known = ", ".join(columns)
+            raise ArgumentError(f"source={self._source}: is no column of train_dataset: {known}")
         for name in ("ignore_data_skip", "remove_unused_columns"):
             if getattr(config, name):
                 raise ArgumentError(f"{name}=True: must be false")
@@ -82,11 +101,18 @@ class TaughtReward(TrainerCallback):
             repeat=config.num_generations,
             group=self._group,
             rounds=self._rounds,
+            sources=None if self._source is None else [*rows[self._source]],
         )
-        self._trainer = trainer
+        self._trainer, self._loader = trainer, trainer.get_train_dataloader
         trainer.train_dataset = rows.add_column(ROW, [*range(self._rows)])
-        trainer._get_train_sampler = lambda *_: self._sampler  # TRL asks for it nowhere else
+        trainer.get_train_dataloader = self._taught_dataloader
         trainer.add_callback(self)
+
+    def _taught_dataloader(self) -> Any:
+        """Returns the trainer's loader, of items that the teacher draws."""
+        loader = self._loader()
+        loader.set_sampler(self._sampler)  # as loaders that accelerate has prepared can
+        return loader
 
     def __call__(self, completions: Sequence[Any], **columns: Any) -> Sequence[float | None]:
         """Returns the rewards; while the model trains, the teacher gets them as results."""
@@ -98,6 +124,9 @@ class TaughtReward(TrainerCallback):
             if not self._again:
                 self._sampler.tell(items, rewards)
                 self._told += 1
+                if log := columns.get("log_metric"):
+                    for name, value in self._sampler.metrics().items():
+                        log(f"curriculum/{name}", value)
             self._again = False
         return rewards
 

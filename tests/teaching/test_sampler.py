@@ -229,6 +229,28 @@ def test_loaders_that_go_on_find_the_place(stateful: bool) -> None:
         assert [*begun, *train(sampler, loader, steps)] == whole
 
 
+@pytest.mark.slow
+def test_loaders_with_workers_go_on_validly() -> None:
+    """An item of an epoch is told once, and its length is kept, though batches are drawn ahead."""
+    stateful = pytest.importorskip("torchdata.stateful_dataloader").StatefulDataLoader
+
+    def train(loader: Any, sampler: prl.TeacherSampler) -> Iterator[list[int]]:
+        for batch in loader:
+            sampler.tell(batch, [1.0] * len(batch))
+            yield batch.tolist()
+
+    _, sampler = replayed(length=24, repeat=1, group=1, rounds=1)
+    loader = stateful(range(9), 4, sampler=sampler, num_workers=1)
+    assert len([*islice(train(loader, sampler), 3)]) == 3
+    states = through_torch([sampler._teacher.state_dict(), loader.state_dict()])
+    teacher, sampler = replayed(length=24, repeat=1, group=1, rounds=1)
+    teacher.load_state_dict(states[0])
+    loader = stateful(range(9), 4, sampler=sampler, num_workers=1)
+    loader.load_state_dict(states[1])
+    assert len([*train(loader, sampler)]) == 3
+    assert not any(sampler.state_dict()["out"].values())
+
+
 class Ranks:
     """torch.distributed in threads of this process."""
 
@@ -311,6 +333,156 @@ def test_processes_have_one_curriculum(tmp_path: Path) -> None:
     multiprocessing.spawn(process, (str(tmp_path),), nprocs=2)
     drawn = [json.loads((tmp_path / f"{rank}").read_text()) for rank in range(2)]
     assert drawn == [of_rank(0, 1)] * 2
+
+
+def test_means_of_several_answers_are_weighted_and_say_what_differed() -> None:
+    """A group in parts, by hand; of one answer nobody knows whether another would differ."""
+    teacher = prl.Teacher("mopps", prl.Items(4), block=4)
+    sampler = prl.TeacherSampler(teacher, 4, repeat=2, sources=["a", "a", "b", "c"])
+    assert not sampler.metrics()
+    items = [*sampler][::2]
+    assert sorted(items) == [*range(4)]
+    sampler.tell([0, 0, 1, 1, 2], [1, 0, 0.25, 0.75, 1], episodes=[3, 1, 1, 1, 4])
+    sampler.tell([2, 3, 3], [1, 0.5, 0.5], episodes=[4, 1, 1])
+    results = teacher._ledger.blocks[0].results
+    told = dict(zip(items, results["success"][0].tolist(), strict=True))
+    assert told == {0: 0.75, 1: 0.5, 2: 1, 3: 0.5}
+    assert dict(zip(items, results["episodes"][0].tolist(), strict=True)) == {
+        0: 4,
+        1: 2,
+        2: 8,
+        3: 2,
+    }
+    names = "success", "yield", "no_variance", "predicted"
+    assert sampler.metrics() == {
+        f"{name}{of}": value
+        for of, *values in (
+            ("", 0.6875, 0.5, 0.5, 0.5),
+            ("/a", 0.625, 1, 0, 0.5),
+            ("/b", 1, 0, 1, 0.5),
+            ("/c", 0.5, 0, 1, 0.5),
+        )
+        for name, value in zip(names, values, strict=True)
+    }
+    assert not sampler.metrics()
+    assert [*sampler]
+    with pytest.raises(ArgumentError, match=r"episodes=0\.5: must be a whole number from 1"):
+        sampler.tell([0], [1.0], episodes=[0.5])
+    with pytest.raises(ArgumentError, match="sources: 3 for 4 items"):
+        prl.TeacherSampler(teacher, 4, sources="abc")
+
+
+def test_what_was_predicted_is_that_of_the_proposal_also_after_a_resume() -> None:
+    """The means of Beta distributions by hand, after one group on each of two items."""
+    teacher = prl.Teacher(prl.curricula.mopps(decay=1.0), prl.Items(2), block=2)
+    sampler = prl.TeacherSampler(teacher, 4)
+    drawn = iter(sampler)
+    sampler.tell([next(drawn), next(drawn)], [0.75, 0.75], episodes=[4, 4])
+    items = [next(drawn), next(drawn)]
+    state = sampler.state_dict()
+    again = prl.Teacher(prl.curricula.mopps(decay=1.0), prl.Items(2), block=2)
+    again.load_state_dict(through_torch(teacher.state_dict()))
+    sampler = prl.TeacherSampler(again, 4)
+    sampler.load_state_dict(through_json(state))
+    sampler.tell(items, [0, 1])
+    assert sampler.metrics()["predicted"] == pytest.approx((1 + 3) / (2 + 4))
+
+
+def test_mixed_groups_are_drawn_until_there_are_enough() -> None:
+    """All that was generated is counted, and told once; what is kept is what was mixed."""
+    teacher = prl.Teacher("domain_randomization", prl.Items(50), block=4)
+    calls: list[tuple[list[int], torch.Tensor]] = []
+
+    def generate(items: list[int]) -> torch.Tensor:
+        success = torch.tensor([[1, item % 3 > 0, 1, 0 if item % 3 == 1 else 1] for item in items])
+        calls.append((items, success.float()))
+        return success if len(calls) % 2 else success.tolist()  # type: ignore[return-value]
+
+    found = prl.mixed_groups(teacher, 6, generate)
+    every = [item for items, _ in calls for item in items]
+    rows = torch.cat([success for _, success in calls])
+    mixed = [place for place, item in enumerate(every) if item % 3 < 2]
+    assert found.places.tolist() == mixed
+    assert len(mixed) == 6
+    assert found.items == [every[place] for place in mixed]
+    assert torch.equal(found.success, rows[mixed].double())
+    assert found.rollouts == 4 * len(every)
+    log = teacher.log()
+    assert (log["told"], log["out"]) == (len(every), 0)
+    assert log["mean_success"] == pytest.approx(rows.mean().item())
+    few = prl.mixed_groups(teacher, 2, lambda items: torch.ones(len(items), 3), most=4)
+    assert (few.items, few.rollouts, tuple(few.success.shape)) == ([], 24, (0, 3))
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        (torch.ones(3), r"generate=\[3\]: must give results \[3, G\]"),
+        (torch.full((3, 2), 2.0), "generate: must give results from 0 to 1"),
+        ([[1, torch.nan]] * 3, "generate: must give results from 0 to 1"),
+    ],
+)
+def test_what_is_no_result_of_groups_drops_them(given: Any, line: str) -> None:
+    teacher = prl.Teacher("domain_randomization", prl.Items(5), block=3)
+    with pytest.raises(ArgumentError, match=line):
+        prl.mixed_groups(teacher, 3, lambda items: given)
+    log = teacher.log()
+    assert (log["dropped"], log["out"], log["told"]) == (3, 0, 0)
+
+
+def loop(
+    sampler: prl.TeacherSampler, ahead: int, done: int, until: int
+) -> Iterator[tuple[int, list[int]]]:
+    """Batches of 4 of a loader whose workers are ``ahead`` of it, past those that were done."""
+    batches = islice(BatchSampler(sampler, 4, drop_last=False), done, None)
+    queue = deque(islice(batches, ahead))
+    for count in range(done, until):
+        batch = queue.popleft()
+        queue.extend(islice(batches, 1))
+        yield count, batch
+
+
+def test_a_loader_that_draws_ahead_goes_on_bit_by_bit_or_at_least_validly() -> None:
+    """By the states of now, rewound; and by that of the sampler when a batch was drawn."""
+
+    def train(sampler: prl.TeacherSampler, done: int = 0, until: int = 9) -> list[list[int]]:
+        seen = []
+        for _, batch in loop(sampler, 3, done, until):
+            sampler.tell(batch, [float(item % 4 == i % 2 == 0) for i, item in enumerate(batch)])
+            seen.append(batch)
+        return seen
+
+    sizes = {"length": 36, "repeat": 1, "group": 1, "rounds": 1}
+    whole = train(replayed(**sizes)[1])
+    assert whole != [*parts(replayed(**sizes)[1], 4)]  # what is told has an effect
+    teacher, sampler = replayed(**sizes)
+    assert train(sampler, until=6) == whole[:6]
+    states = through_torch([teacher.state_dict(), sampler.state_dict()])
+    teacher, sampler = replayed(**sizes)
+    teacher.load_state_dict(states[0])
+    sampler.load_state_dict(states[1])
+    sampler.rewind()
+    assert train(sampler, 6) == whole[6:]
+
+    teacher, sampler = replayed(**sizes)
+    state, batches = None, []
+    for count, batch in enumerate(parts(sampler, 4)):
+        if count == 1:
+            state = through_json(sampler.state_dict())  # two batches are out
+        batches.append(batch)
+        if count == 3:
+            break
+    sampler.tell(batches[0], [1.0] * 4)
+    later = through_torch(teacher.state_dict())
+    teacher, sampler = replayed(**sizes)
+    teacher.load_state_dict(later)
+    sampler.load_state_dict(state)
+    out = sampler.state_dict()["out"]
+    assert sum(map(len, out.values())) == 4
+    sampler.tell(batches[1], [1.0] * 4)
+    for batch in parts(sampler, 4):
+        sampler.tell(batch, [1.0] * 4)
+    assert not sampler.state_dict()["out"]
 
 
 @pytest.mark.parametrize(("part", "delay"), [(1.0, 0), (1.0, 40), (0.5, 0), (0.27, 8)])

@@ -49,8 +49,24 @@ def taught(monkeypatch: pytest.MonkeyPatch) -> Any:
 class Rows(list[dict[str, Any]]):
     """What is used of a data set."""
 
+    @property
+    def column_names(self) -> list[str]:
+        return [*super().__getitem__(0)]
+
+    def __getitem__(self, which: Any) -> Any:
+        return (
+            [row[which] for row in self] if isinstance(which, str) else super().__getitem__(which)
+        )
+
     def add_column(self, name: str, values: list[int]) -> Rows:
         return Rows({**row, name: value} for row, value in zip(self, values, strict=True))
+
+
+class Loader(DataLoader[Any]):
+    """What is used of a loader that accelerate has prepared."""
+
+    def set_sampler(self, sampler: Any) -> None:
+        self.batch_sampler.sampler = sampler  # type: ignore[union-attr]
 
 
 class Trainer:
@@ -75,14 +91,14 @@ class Trainer:
             remove_unused_columns=False,
         )
         self.reward, self.model = reward, SimpleNamespace(training=True)
+        self.reward_funcs, self.logged = [reward], dict[str, list[float]]()
         self.train_dataset = Rows({"prompt": f"{row}", "row": row} for row in range(ROWS))
         self.callbacks: list[Any] = []
         self.add_callback = self.callbacks.append
 
     def train(self, steps: int, resume_at: int = 0) -> None:
-        args, sampler = self.args, self._get_train_sampler()
-        size, per_step = args.generation_batch_size, args.gradient_accumulation_steps
-        loader = DataLoader(self.train_dataset, size, sampler=sampler, collate_fn=list)  # type: ignore[arg-type]
+        args, loader = self.args, self.get_train_dataloader()
+        per_step = args.gradient_accumulation_steps
         state, count = SimpleNamespace(global_step=resume_at), 0
         of_epoch = -(-len(loader) // per_step)
         for callback in self.callbacks:
@@ -110,12 +126,15 @@ class Trainer:
                     for callback in self.callbacks:
                         callback.on_save(args, state, None)
 
-    def _get_train_sampler(self) -> Any:
-        raise NotImplementedError
+    def get_train_dataloader(self) -> Any:
+        return Loader(self.train_dataset, self.args.generation_batch_size, collate_fn=list)  # type: ignore[arg-type]
 
     def generate(self, batch: list[dict[str, Any]]) -> None:
-        columns = {name: [row[name] for row in batch] for name in batch[0]}
-        self.reward(completions=[""] * len(batch), **columns)
+        columns: dict[str, Any] = {name: [row[name] for row in batch] for name in batch[0]}
+        self.reward(completions=[""] * len(batch), **columns, log_metric=self.log_metric)
+
+    def log_metric(self, name: str, value: float) -> None:
+        self.logged.setdefault(name, []).append(value)
 
 
 def real(reward: Any, settings: Settings, folder: Path) -> Any:
@@ -133,7 +152,7 @@ def real(reward: Any, settings: Settings, folder: Path) -> Any:
     model = GPT2LMHeadModel(GPT2Config(**sizes, eos_token_id=1, pad_token_id=0))
     quiet = {"use_cpu": True, "bf16": False, "report_to": [], "disable_tqdm": True}
     groups = {"num_generations": ANSWERS, "max_completion_length": 1, **settings}
-    often = {"save_steps": 1, "eval_strategy": "steps", "eval_steps": 1, "logging_steps": 1000}
+    often = {"save_steps": 1, "eval_strategy": "steps", "eval_steps": 1, "logging_steps": 1}
     config = GRPOConfig(str(folder), **groups, **quiet, **often, per_device_eval_batch_size=4)
     rows = Dataset.from_list([{"prompt": f"{row}", "row": row} for row in range(ROWS)])
     made = GRPOTrainer(model, reward, config, rows, rows.select([0, 1]), processing_class=tokenizer)
@@ -206,6 +225,56 @@ def test_what_is_not_scored_is_dropped(taught: Any, tmp_path: Path) -> None:
         assert sum(map(len, reward._sampler.state_dict()["out"].values())) == 4  # a group ahead
 
 
+def test_what_groups_were_like_is_logged(taught: Any, tmp_path: Path) -> None:
+    """Of each generation, against a count of its own; evaluation logs nothing."""
+    teacher = prl.Teacher("domain_randomization", prl.Items(ROWS), block=4)
+    seen: list[list[int]] = []
+
+    def solved(completions: list[str], row: list[int], **_: Any) -> list[float]:
+        seen.append(row)
+        return [float(i % 2 if item < 4 else item < 7) for i, item in enumerate(row)]
+
+    reward = taught(teacher, solved, source="parity")
+    trainer = Trainer(reward, SETTINGS["a generation a step"], tmp_path)
+    parities = ["odd" if row % 2 else "even" for row in range(ROWS)]
+    trainer.train_dataset = Rows(
+        {**row, "parity": one} for row, one in zip(trainer.train_dataset, parities, strict=True)
+    )
+    reward.attach(trainer)
+    trainer.train(3)
+    trained = seen[::2]  # an evaluation follows each
+    assert len(trained) == 3
+    for of in ("", "/odd", "/even"):
+        groups = [[i for i in one[::2] if of in ("", "/" + parities[i])] for one in trained]
+        mixed = [sum(i < 4 for i in some) / len(some) for some in groups if some]
+        right = [sum(0.5 if i < 4 else i < 7 for i in some) / len(some) for some in groups if some]
+        assert trainer.logged[f"curriculum/yield{of}"] == mixed
+        assert trainer.logged[f"curriculum/no_variance{of}"] == [1 - one for one in mixed]
+        assert trainer.logged[f"curriculum/success{of}"] == right
+    with pytest.raises(ArgumentError, match="trainer: is another one"):
+        reward.attach(trainer)
+
+
+@pytest.mark.slow
+def test_trl_logs_it_as_its_own_metrics(taught: Any, tmp_path: Path) -> None:
+    """Groups without variance and mean rewards are what TRL finds of them itself."""
+    teacher = prl.Teacher("domain_randomization", prl.Items(ROWS), block=4)
+    reward = taught(
+        teacher, lambda completions, row, **_: [i % 2 if n < 5 else 1.0 for i, n in enumerate(row)]
+    )
+    trainer = real(reward, SETTINGS["a generation a step"], tmp_path)
+    reward.attach(trainer)
+    trainer.train(4)
+    logs = [log for log in trainer.state.log_history if "curriculum/yield" in log]
+    assert len(logs) == 4
+    for log in logs:
+        assert log["curriculum/no_variance"] == pytest.approx(log["frac_reward_zero_std"])
+        assert log["curriculum/success"] == pytest.approx(log["reward"])
+    every = {name for log in trainer.state.log_history for name in log}
+    assert "eval_reward" in every
+    assert not any(name.startswith("eval_curriculum") for name in every)
+
+
 async def awaited(**_: Any) -> list[float]:
     return [1.0]
 
@@ -218,6 +287,12 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a coroutine": ({"reward": awaited}, "reward: must be no coroutine"),
     "not attached": ({"attach": False}, "trainer: missing: call attach"),
     "no checkpoint": ({"resume_at": 3}, "resume_from_checkpoint=.*checkpoint-3: has no teacher.pt"),
+    "no such column": (
+        {"source": "family"},
+        "source=family: is no column of train_dataset: prompt, row$",
+    ),
+    "two of them": ({"rows_of": "teacher_item"}, "train_dataset: has a column teacher_item"),
+    "not its reward": ({"reward_funcs": []}, "reward_funcs: must have this TaughtReward"),
     "no share": ({"reward": lambda row, **_: [torch.nan] * len(row)}, "success=nan: must be from"),
     "no items": ({"space": prl.Parameters({"gravity": (5.0, 25.0)})}, "a space of Items"),
 }
@@ -229,9 +304,13 @@ def test_what_does_not_fit_is_refused_in_one_line(taught: Any, what: str, tmp_pa
     with pytest.raises(ArgumentError, match=message):
         space = given.get("space") or prl.Items(given.get("items", ROWS))
         teacher = prl.Teacher("domain_randomization", space)
-        reward = taught(teacher, given.get("reward", lambda row, **_: [1.0] * len(row)))
+        function = given.get("reward", lambda row, **_: [1.0] * len(row))
+        reward = taught(teacher, function, given.get("source"))
         trainer = Trainer(reward, SETTINGS["a generation a step"], tmp_path)
         trainer.train_dataset = given.get("train_dataset", trainer.train_dataset)
+        trainer.reward_funcs = given.get("reward_funcs", trainer.reward_funcs)
+        if "rows_of" in given:
+            trainer.train_dataset = trainer.train_dataset.add_column(given["rows_of"], [0] * ROWS)
         vars(trainer.args).update(
             {name: given[name] for name in given if hasattr(trainer.args, name)}
         )
