@@ -48,6 +48,7 @@ from proposer_rl.curricula.progress import LearningProgressCurriculum as Learnin
 from proposer_rl.curricula.proposer import ProposerCurriculum as ProposerCurriculum
 from proposer_rl.curricula.proposer import ProposerTrainer as ProposerTrainer
 from proposer_rl.curricula.replay import ReplayCurriculum as ReplayCurriculum
+from proposer_rl.curricula.rows import RowsCurriculum as RowsCurriculum
 from proposer_rl.curricula.sampling import SamplingCurriculum as SamplingCurriculum
 from proposer_rl.curricula.sampling import SelectionCurriculum as SelectionCurriculum
 from proposer_rl.curricula.scores import Scorer as Scorer
