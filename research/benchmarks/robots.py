@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import time
+from itertools import pairwise
+from statistics import median
 from typing import Any
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
+from torch.distributions import Normal
 
 from proposer_rl import LevelTerm, Parameters, Teacher
 from proposer_rl.tasks.robots import RobotEnv
+from research.benchmarks.results import Options, Result, Row, Spread
 
 RANGES = {"step": (0.0, 0.4), "slope": (-0.25, 0.25), "speed": (0.5, 1.5)}
 LIMIT = 60
+ROBOTS, METHODS = 4096, ("terrain_levels", "adr", "adaptive_mixture")
 
 
 class Terrain(LevelTerm):
@@ -90,3 +96,113 @@ class Fleet:
 
     def _chance(self) -> Tensor:
         return torch.rand(self.num_envs, RobotEnv.draws, device=self.device)
+
+
+class _Timed:
+    """A teacher, and the seconds that its calls have taken."""
+
+    def __init__(self, teacher: Teacher) -> None:
+        self._teacher, self.seconds = teacher, 0.0
+
+    def __getattr__(self, name: str) -> Any:
+        def call(*arguments: Any) -> Any:
+            start = time.perf_counter()
+            result = getattr(self._teacher, name)(*arguments)
+            self.seconds += time.perf_counter() - start
+            return result
+
+        return call
+
+
+def _timed(name: str) -> type[Terrain]:
+    class Term(Terrain):
+        method = name
+
+        def make_teacher(self) -> Any:
+            return _Timed(super().make_teacher())
+
+    return Term
+
+
+class _Learner:
+    """PPO with rsl_rl's numbers and Isaac Lab's network for flat ground, without its bookkeeping."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self.fleet, self.seen = fleet, fleet.get_observations()["policy"]
+        sizes = (RobotEnv.observation_size, 128, 128, 128)
+        self.actor, self.critic = (
+            nn.Sequential(
+                *[part for a, b in pairwise(sizes) for part in (nn.Linear(a, b), nn.ELU())],
+                nn.Linear(sizes[-1], out),
+            ).to(fleet.device)
+            for out in (RobotEnv.forces, 1)
+        )
+        weights = [*self.actor.parameters(), *self.critic.parameters()]
+        self.optimizer = torch.optim.Adam(weights, lr=1e-3)
+
+    def step(self) -> None:
+        """24 steps of all robots, and five epochs on them in four parts."""
+        seen, acted, rewards, ends = [], [], [], []
+        with torch.inference_mode():
+            for _ in range(24):
+                action = Normal(self.actor(self.seen), 1.0).sample()
+                after, reward, done, _ = self.fleet.step(action)
+                seen.append(self.seen)
+                acted.append(action)
+                rewards.append(reward)
+                ends.append(done)
+                self.seen = after["policy"]
+            x, actions = torch.cat(seen), torch.cat(acted)
+            values = self.critic(torch.cat([x, self.seen])).view(25, -1)
+            before = Normal(self.actor(x), 1.0).log_prob(actions).sum(-1)
+            ahead, gains = torch.zeros_like(values[0]), []
+            for t in reversed(range(24)):
+                goes_on = 0.99 * (1 - ends[t])
+                error = rewards[t] + goes_on * values[t + 1] - values[t]
+                ahead = error + 0.95 * goes_on * ahead
+                gains.append(ahead)
+            gain = torch.cat(gains[::-1])
+            aims = gain + values[:-1].flatten()
+        # What was made in inference mode takes no part in gradients.
+        x, actions, before, gain, aims = (one.clone() for one in (x, actions, before, gain, aims))
+        for _ in range(5):
+            for some in torch.randperm(len(x), device=x.device).chunk(4):
+                policy = Normal(self.actor(x[some]), 1.0)
+                ratio = (policy.log_prob(actions[some]).sum(-1) - before[some]).exp()
+                own = (gain[some] - gain[some].mean()) / gain[some].std()
+                clipped = torch.minimum(ratio * own, ratio.clamp(0.8, 1.2) * own)
+                missed = (self.critic(x[some]).squeeze(-1) - aims[some]).square()
+                self.optimizer.zero_grad()
+                (missed - clipped).mean().backward()
+                self.optimizer.step()
+
+
+def robots(options: Options) -> Result:
+    """Steps of many robots and of PPO, with the teacher's calls timed within."""
+    count = 64 if options.tiny else ROBOTS
+    rows = []
+    for method in METHODS:
+        fleet = Fleet(count, _timed(method), options.device)
+        learner, teacher = _Learner(fleet), fleet.term.teacher
+        seconds: dict[str, list[float]] = {"all": [], "teacher": []}
+        for iteration in range(1 + options.few):
+            teacher.seconds, start = 0.0, time.perf_counter()
+            learner.step()
+            if iteration:  # not the first, in which all robots fall
+                seconds["all"].append(time.perf_counter() - start)
+                seconds["teacher"].append(teacher.seconds)
+        shares = [
+            own / every for own, every in zip(seconds["teacher"], seconds["all"], strict=True)
+        ]
+        rows.append(
+            Row(
+                f"{method}, ask and tell of {count} robots",
+                f"an iteration of {median(seconds['all']):.2f} s: 24 steps, PPO's five epochs",
+                Spread.of(shares),
+                "%",
+                target=0.01,
+                at_most=True,
+                samples=seconds,
+            )
+        )
+    return Result(rows)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 import proposer_rl as prl
-from research.benchmarks.robots import LIMIT, Fleet, Terrain
+from research.benchmarks.robots import LIMIT, Fleet
 
 COUNT = 6
 SPACE = prl.Parameters({"row": range(4), "speed": (0.0, 2.0)}, bins={"row": 4})
