@@ -125,7 +125,7 @@ def _timed(name: str) -> type[Terrain]:
 
 
 class _Learner:
-    """PPO with rsl_rl's numbers and Isaac Lab's network for flat ground, without its bookkeeping."""
+    """PPO with rsl_rl's numbers and Isaac Lab's network for flat ground."""
 
     def __init__(self, fleet: Fleet) -> None:
         self.fleet, self.seen = fleet, fleet.get_observations()["policy"]
@@ -191,14 +191,12 @@ def robots(options: Options) -> Result:
             if iteration:  # not the first, in which all robots fall
                 seconds["all"].append(time.perf_counter() - start)
                 seconds["teacher"].append(teacher.seconds)
-        shares = [
-            own / every for own, every in zip(seconds["teacher"], seconds["all"], strict=True)
-        ]
+        pairs = zip(seconds["teacher"], seconds["all"], strict=True)
         rows.append(
             Row(
                 f"{method}, ask and tell of {count} robots",
                 f"an iteration of {median(seconds['all']):.2f} s: 24 steps, PPO's five epochs",
-                Spread.of(shares),
+                Spread.of([own / every for own, every in pairs]),
                 "%",
                 target=0.01,
                 at_most=True,

@@ -1,4 +1,4 @@
-"""Terms of curriculum managers, by a stand-in for Isaac Lab's and by mjlab's own; rsl_rl's runner."""
+"""Terms of curriculum managers: a stand-in for Isaac Lab's, mjlab's own; rsl_rl's runner."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class TermCfg:
 
 
 class Manager:
-    """What Isaac Lab's manager does with a term: copies its config, checks it, makes and calls it."""
+    """What Isaac Lab's does with a term: copies its config, checks it, makes and calls it."""
 
     def __init__(self, cfg: dict[str, TermCfg], env: Any) -> None:
         self.env, self.states = env, dict.fromkeys(cfg)
@@ -227,6 +227,6 @@ def test_a_runner_of_rsl_rl_learns_and_keeps_the_teacher(tmp_path: Path) -> None
         tmp_path / "old.pt",
     )
     with pytest.raises(
-        prl.ArgumentError, match="old.pt: has no teacher; another runner has saved it"
+        prl.ArgumentError, match=r"old\.pt: has no teacher; another runner has saved it"
     ):
         other.load(str(tmp_path / "old.pt"))
