@@ -30,7 +30,8 @@ class Terrain(LevelTerm):
     def make_teacher(self) -> Teacher:
         """Returns a teacher of ten rows, to master the last."""
         space = Parameters(RANGES, bins={"step": 10}, target={"step": (0.36, 0.4)})
-        return Teacher(self.method, space, seed=self.seed, device=self.env.device)
+        block = self.env.num_envs  # as many as there are robots cost less at once
+        return Teacher(self.method, space, seed=self.seed, device=self.env.device, block=block)
 
     def results(self, env_ids: Tensor) -> tuple[Tensor, Tensor]:
         """Returns how well the robots followed the command, and whether they came far enough."""
@@ -183,7 +184,8 @@ def robots(options: Options) -> Result:
     rows = []
     for method in METHODS:
         fleet = Fleet(count, _timed(method), options.device)
-        learner, teacher = _Learner(fleet), fleet.term.teacher
+        learner = _Learner(fleet)
+        teacher: Any = fleet.term.teacher
         seconds: dict[str, list[float]] = {"all": [], "teacher": []}
         for iteration in range(1 + options.few):
             teacher.seconds, start = 0.0, time.perf_counter()
@@ -194,7 +196,7 @@ def robots(options: Options) -> Result:
         pairs = zip(seconds["teacher"], seconds["all"], strict=True)
         rows.append(
             Row(
-                f"{method}, ask and tell of {count} robots",
+                f"{method}, ask and tell, {count} robots",
                 f"an iteration of {median(seconds['all']):.2f} s: 24 steps, PPO's five epochs",
                 Spread.of([own / every for own, every in pairs]),
                 "%",
