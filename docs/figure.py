@@ -1,4 +1,7 @@
-"""Draws the README's figure from the published runs: ``.venv/bin/python docs/figure.py``."""
+"""Draws the README's figure from the published runs, and that of terrain levels from arithmetic.
+
+``.venv/bin/python docs/figure.py``
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pandas as pd
 from PIL import Image
 
@@ -46,10 +50,41 @@ def main(results: Path = RESULTS) -> None:
         xlim=(0, 400), ylim=(0, 1), xlabel="updates of the Solver", ylabel="success on the target"
     )
     axes.spines[["top", "right"]].set_visible(False)
-    file = Path(__file__).parent / "learning_curves.png"
+    _save(figure, "learning_curves.png")
+
+
+def terrain_levels(rows: int = 10) -> None:
+    """Draw where robots are in the long run, by the rule of legged_gym, to terrain_levels.png."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8, 2.8), layout="constrained")
+    for shift, success in enumerate((1.0, 0.8, 0.6)):
+        places = np.arange(rows) + 0.27 * (shift - 1)
+        left.bar(places, _stationary(success, rows), 0.27, label=f"success {success:.0%}")
+    left.set(xlabel="row", ylabel="share of the episodes", xticks=range(rows))
+    left.legend(frameon=False)
+    chances = np.linspace(0, 1, 101)
+    right.plot(chances, [_stationary(p, rows) @ np.arange(rows) for p in chances], lw=2)
+    right.axhline(2 * (rows - 1) / 3, color="#555555", lw=1, ls=":")
+    right.set(xlabel="success in every row", ylabel="mean level", xlim=(0, 1), ylim=(0, rows - 1))
+    for axes in (left, right):
+        axes.spines[["top", "right"]].set_visible(False)
+    _save(figure, "terrain_levels.png")
+
+
+def _stationary(success: float, rows: int) -> np.ndarray:
+    """Return the shares of the rows in the long run, with the same success in all of them."""
+    up, down = np.eye(rows, k=1), np.eye(rows, k=-1)
+    up[-1], down[0, 0] = 1 / rows, 1
+    chain = success * up + (1 - success) * down
+    balance = np.vstack([chain.T - np.eye(rows), np.ones(rows)])
+    return np.linalg.lstsq(balance, np.eye(rows + 1)[-1])[0]
+
+
+def _save(figure: plt.Figure, name: str) -> None:
+    file = Path(__file__).parent / name
     figure.savefig(file, dpi=100)
     Image.open(file).convert("RGB").quantize(64).save(file, optimize=True)
 
 
 if __name__ == "__main__":
     main(*map(Path, sys.argv[1:]))
+    terrain_levels()

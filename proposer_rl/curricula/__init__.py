@@ -52,6 +52,7 @@ from proposer_rl.curricula.prompts import CategoryBandit as CategoryBandit
 from proposer_rl.curricula.proposer import ProposerCurriculum as ProposerCurriculum
 from proposer_rl.curricula.proposer import ProposerTrainer as ProposerTrainer
 from proposer_rl.curricula.replay import ReplayCurriculum as ReplayCurriculum
+from proposer_rl.curricula.rows import RowsCurriculum as RowsCurriculum
 from proposer_rl.curricula.sampling import SamplingCurriculum as SamplingCurriculum
 from proposer_rl.curricula.sampling import SelectionCurriculum as SelectionCurriculum
 from proposer_rl.curricula.scores import Scorer as Scorer

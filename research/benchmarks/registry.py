@@ -18,6 +18,7 @@ from research.benchmarks.meta import memory, meta_step
 from research.benchmarks.placement import throughput
 from research.benchmarks.processes import in_processes
 from research.benchmarks.results import Options, Result
+from research.benchmarks.robots import robots
 from research.benchmarks.solver import against_plain, in_both_precisions, overhead, population
 from research.benchmarks.teacher import teacher_calls
 from research.benchmarks.view import view_steps
@@ -57,6 +58,7 @@ BENCHMARKS = {
     "update": Benchmark("a Solver update against the plain TorchRL way", against_plain),
     "curricula": Benchmark("seconds of an update by curriculum", update_seconds),
     "teacher": Benchmark("an ask and a tell in a loop of one's own", teacher_calls),
+    "robots": Benchmark("the teacher's share of what thousands of robots cost", robots),
     "workers": Benchmark("rollouts of the copies in one worker and in two", throughput),
     "gpu": Benchmark("milliseconds and seconds on a GPU, a minute or two", gpu_targets, "cuda"),
     "memory": Benchmark("peak memory at the paper's values (a minute)", memory, "full"),

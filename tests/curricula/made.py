@@ -22,6 +22,7 @@ from proposer_rl.curricula import (
     ProposerCurriculum,
     ReplayCurriculum,
     ReplayRule,
+    RowsCurriculum,
     SampledFirstOrderCurriculum,
     SampledFirstOrderProposer,
     SamplingCurriculum,
@@ -157,6 +158,7 @@ MADE: dict[str, Make] = {
         SPACE, source="exact", warmup=8, refit=6, components=3
     ),
     "adr": lambda: BoundsCurriculum(SPACE, boundary=0.9, episodes=3, lower=0.0, upper=0.1),
+    "terrain_levels": lambda: RowsCurriculum(SPACE, measure="return", lower=0.0, upper=0.1),
     "spdl": lambda: SelfPacedCurriculum(
         SPACE, TARGET, TASK.target_shares, delta=0.01, episodes=6, measure="return"
     ),

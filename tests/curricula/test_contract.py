@@ -156,7 +156,7 @@ def test_the_order_in_which_parts_come_back_has_no_effect(name: str) -> None:
 
 
 LEARNING = ["plr", "accel", "progress of episodes", "alp_gmm", "first order, sampled", "paired"]
-LEARNING += ["adr", "spdl", "adaptive_mixture"]
+LEARNING += ["adr", "terrain_levels", "spdl", "adaptive_mixture"]
 
 
 @pytest.mark.parametrize(

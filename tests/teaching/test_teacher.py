@@ -133,6 +133,7 @@ FREE = {  # of what needs nothing of a learner, settings that are small
     "alp_gmm": {"warmup": 16, "refit": 12, "components": 3},
     "learning_progress": {"source": "episodes"},
     "adr": {"episodes": 2},
+    "terrain_levels": {},
     "spdl": {"episodes": 8},
     "adaptive_mixture": {},
     "mopps": {},
@@ -175,8 +176,8 @@ def test_whoever_needs_nothing_works_from_returns_and_success(name: str, space: 
     if space == "a task" and name == "hand_designed":
         settings = {"distributions": ["id", "id"], "until": [2]}
     recipe = getattr(prl.curricula, name)(**settings)
-    bins = {"alp_gmm", "adr", "spdl", "learning_progress", "model_transport", "mixture"}
-    bins |= {"mopps", "arc_length"}
+    bins = {"alp_gmm", "adr", "terrain_levels", "spdl", "learning_progress", "model_transport"}
+    bins |= {"mixture", "mopps", "arc_length"}
     if space == "a generator" and name in bins:
         with pytest.raises(ArgumentError, match="draws from bins"):
             prl.Teacher(recipe, SPACES[space]())

@@ -1,0 +1,138 @@
+"""Terrain levels: a row up after a success, a row down after a failure, anywhere after the last."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from math import prod
+from typing import Annotated, Any
+
+import torch
+from annotated_types import Ge
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
+from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.points import measured
+from proposer_rl.curricula.student import Student
+from proposer_rl.settings import ArgumentError, checked
+from proposer_rl.streams import Streams
+from proposer_rl.task import Space
+
+
+class RowsCurriculum(Curriculum):
+    """The rule of ``legged_gym`` for robots on terrains whose rows are harder and harder.
+
+    A robot whose level in row r came to at least ``upper`` gets one in row r + 1 next, one whose
+    level came to less than ``lower`` one in row r - 1, others stay; there is none below the first.
+    Whoever passes the last row gets a row drawn uniformly (Rudin et al. 2021, "Learning to Walk in
+    Minutes Using Massively Parallel Deep Reinforcement Learning", arXiv 2109.11978).
+
+    A robot's next level is the next one that is proposed: levels that come back queue up. Levels
+    that are proposed when the queue is empty, as at first, begin in a row from 0 to ``start``,
+    drawn uniformly. All else of a level is uniform.
+
+    Args:
+        space: that has the bins.
+        row: the axis whose bins are the rows; None for the one of this name or, if there is none,
+            the first.
+        start: the last of the rows to begin in, if there are so many.
+        lower: what a level comes to, below which it goes down.
+        upper: from which on it goes up.
+        measure: of what levels come to, ``"success"`` or ``"return"``.
+
+    Raises:
+        ArgumentError: for an unknown axis, one of a single row, or ``lower`` above ``upper``.
+    """
+
+    remembers = ("_queue", "_counts", "_last", "_inbox")
+
+    @checked
+    def __init__(
+        self,
+        space: Space,
+        *,
+        row: str | None = None,
+        start: Annotated[int, Ge(0)] = 5,
+        lower: float = 0.5,
+        upper: float = 0.5,
+        measure: Measure = "success",
+    ) -> None:
+        names = [*space.axes]
+        name = row or ("row" if "row" in names else names[0])
+        if name not in names:
+            raise ArgumentError(f"row={name}: unknown; there are: {', '.join(names)}")
+        if lower > upper:
+            raise ArgumentError(f"lower={lower}: must be at most upper={upper}")
+        sizes = [len(values) for values in space.axes.values()]
+        axis = names.index(name)
+        self._rows = sizes[axis]
+        if self._rows < 2:
+            raise ArgumentError(f"row={name}: has a single row; give it bins")
+        _warn_of_merged(space, name)
+        # The number of a bin is (before * rows + row) * after + rest.
+        self._before, self._after = prod(sizes[:axis]), prod(sizes[axis + 1 :])
+        self.space, self._start = space, min(start, self._rows - 1)
+        self.reads = ("success",) if measure == "success" else ()
+        self._lower, self._upper, self._measure = lower, upper, measure
+        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
+        self._last = torch.zeros(0, dtype=torch.int64)  # rows of the last batch, [K, n]
+        self._queue = torch.zeros(1, 0, dtype=torch.int64)  # rows [K, m] of the next levels
+        self._inbox = Inbox()
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Returns levels [K, n] in the rows that are next."""
+        moved = [evidence["next"] for evidence in self._inbox.take()]
+        queue = torch.cat([self._queue.expand(len(streams), -1), *moved], 1)
+        next_rows, self._queue = queue[:, :count], queue[:, count:]
+        draws = [s.generator("choices") for s in streams]
+
+        def uniform(high: int) -> Tensor:
+            return torch.stack([torch.randint(high, (count,), generator=draw) for draw in draws])
+
+        first, anywhere = uniform(self._start + 1), uniform(self._rows)
+        rows = torch.cat([next_rows, first[:, next_rows.shape[1] :]], 1)
+        rows = rows.where(rows < self._rows, anywhere)
+        self._last = rows
+        bins = (uniform(self._before) * self._rows + rows) * self._after + uniform(self._after)
+        levels = self.space.generate(bins, [s.generator("levels") for s in streams])
+        return self._inbox.batch(levels, bins=bins, row=rows)
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Keeps the rows that follow, for the next proposal.
+
+        Raises:
+            ValueError: if the outcome has no success and success is the measure.
+        """
+        self._inbox.check(batch, outcome)
+        reached = measured(outcome, self._measure).cpu()
+        move = (reached >= self._upper).long() - (reached < self._lower).long()
+        self._counts += counts_of_bins(batch.notes["bins"], self.space)
+        self._inbox.put(batch, next=(batch.notes["row"] + move).clamp(min=0))
+
+    def log(self) -> dict[str, Any]:
+        """Returns counts of levels by bin, and of the last batch the mean row and the last's share.
+
+        Rows count from 0.
+        """
+        if not len(self._last):
+            return {}
+        counts, self._counts = self._counts, torch.zeros_like(self._counts)
+        return {
+            "histogram": along_axes(counts, self.space),
+            "mean_row": self._last.double().mean(1).tolist(),
+            "last_row": (self._last == self._rows - 1).double().mean(1).tolist(),
+        }
+
+
+def _warn_of_merged(space: Any, name: str) -> None:
+    """Warns of whole numbers that share a row, which were rows perhaps themselves."""
+    part = getattr(space, "bins", {}).get(name)
+    if part is not None and not part.low.is_floating_point() and bool((part.low < part.high).any()):
+        numbers = int(part.high[-1] - part.low[0]) + 1
+        warnings.warn(
+            f"{name}: {numbers} whole numbers in {len(part.low)} rows; "
+            f"bins={{{name!r}: {numbers}}} gives each its own",
+            stacklevel=2,
+        )

@@ -1,0 +1,73 @@
+"""Robots that walk up and down terrains with steps: thousands at once, on torch alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+
+DT = 0.1  # seconds of a step
+APART = 1.0  # metres between two edges of the terrain
+HIGHEST = 0.5  # that a foot gets
+TILTED = 0.5  # from which a robot falls
+FAR = 0.8  # of the way that was commanded, which has to be walked
+
+
+class RobotEnv(BatchedEnv):
+    """A body that leans over, with a foot that has to be lifted over every edge of the terrain.
+
+    A level's ``step`` is the height of the edges, ``slope`` that of the ground between them, and
+    ``speed`` is commanded. The three actions push forward, lift the foot, and turn the body, which
+    is unstable. A lifted foot pushes less. A foot that is too low at an edge stops the robot and
+    makes it stumble. Every step returns how near the speed is to what is commanded, at most 1 in an
+    episode; it ends where the body falls. Success is to stand at the end and to have walked most of
+    the way.
+    """
+
+    state_size: ClassVar[int] = 5
+    observation_size: ClassVar[int] = 8
+    forces: ClassVar[int] = 3
+    draws: ClassVar[int] = 3
+
+    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+        """Returns place, speed, height of the foot, lean and its speed: near rest."""
+        place, lean, turning = chance.unbind(-1)
+        none = torch.zeros_like(place)
+        state = [0.5 * APART * place, none, none, 0.1 * lean - 0.05, 0.1 * turning - 0.05]
+        return torch.stack(state, -1)
+
+    def advance(
+        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
+    ) -> Step:
+        """Returns where the robot is after a step of Euler's method."""
+        place, speed, foot, lean, turning = state.unbind(-1)
+        push, lift, turn = action.unbind(-1)
+        foot = (foot + 0.15 * lift).clamp(0, HIGHEST)
+        force = 4 * push * (1 - foot / HIGHEST)
+        speed = speed + DT * (force - 4 * level["slope"] - speed)
+        moved = place + DT * speed
+        edge = (moved / APART).floor() > (place / APART).floor()
+        missing = (level["step"] - foot).clamp(min=0) * edge
+        stumbles = missing > 0
+        speed = torch.where(stumbles, 0.0, speed)
+        moved = torch.where(stumbles, (moved / APART).floor() * APART, moved)
+        shaken = 0.2 * (chance[..., 0] - 0.5) + 4 * missing
+        turning = turning + DT * (4 * lean.sin() + 4 * turn - 0.5 * push - turning) + shaken
+        lean = lean + DT * turning
+        fell = lean.abs() > TILTED
+        reward = (-4 * (speed - level["speed"]).square()).exp() / self.max_steps
+        far = moved >= FAR * DT * self.max_steps * level["speed"]
+        state = torch.stack([moved, speed, foot, lean, turning], -1)
+        return Step(state, reward, fell, far & ~fell)
+
+    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+        """Returns what a robot feels and sees, each about -1 to 1."""
+        place, speed, foot, lean, turning = state.unbind(-1)
+        ahead = 1 - (place / APART).frac()
+        body = [speed - 1, 4 * foot - 1, lean / TILTED, turning, 2 * ahead - 1]
+        ground = [level["speed"] - 1, 4 * level["step"] - 1, 4 * level["slope"]]
+        return torch.stack([*body, *ground], -1)

@@ -1,0 +1,117 @@
+"""Terrain levels against the Markov chain that they are, and one robot after another."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import pytest
+import torch
+
+import proposer_rl as prl
+from proposer_rl.curricula import RowsCurriculum, Student
+from proposer_rl.streams import Streams
+from tests.curricula.scripted import reached
+
+ROWS = 10
+SPACE = prl.Parameters({"speed": (0.0, 2.0), "row": range(ROWS)}, bins={"speed": 3, "row": ROWS})
+
+
+def stationary(success: list[float]) -> torch.Tensor:
+    """Shares of the rows in the long run, by linear algebra on the chain of one robot."""
+    rows = len(success)
+    chain = torch.zeros(rows, rows, dtype=torch.float64)
+    for row, p in enumerate(success):
+        chain[row, max(row - 1, 0)] += 1 - p
+        if row + 1 < rows:
+            chain[row, row + 1] += p
+        else:
+            chain[row] += p / rows
+    balance = torch.cat([chain.T - torch.eye(rows).double(), torch.ones(1, rows).double()])
+    total = torch.zeros(rows + 1).double()
+    total[-1] = 1
+    return torch.linalg.lstsq(balance, total.unsqueeze(1)).solution.squeeze(1)
+
+
+def test_a_perfect_policy_is_in_row_six_of_ten_on_average() -> None:
+    """The j-th row's share is j to 1, so that the mean of R rows from 0 on is 2 (R - 1) / 3."""
+    shares = stationary([1.0] * ROWS)
+    torch.testing.assert_close(shares, torch.arange(1, ROWS + 1) / 55.0, check_dtype=False)
+    assert shares @ torch.arange(ROWS).double() == pytest.approx(6.0)
+    assert shares[-1] == pytest.approx(2 / 11)
+    assert stationary([1.0] * 20) @ torch.arange(20).double() == pytest.approx(2 * 19 / 3)
+
+
+@pytest.mark.parametrize("success", [[1.0] * ROWS, [0.95 - 0.06 * row for row in range(ROWS)]])
+def test_levels_are_in_rows_as_often_as_the_chain_says(success: list[float]) -> None:
+    """A teacher's, thousands out at once, of which half end at each step."""
+    teacher = prl.Teacher("terrain_levels", SPACE, seed=1)
+    robots, draw = 1024, torch.Generator().manual_seed(0)
+    ids, levels = teacher.ask(robots)
+    assert levels["row"].max() == 5 and levels["row"].min() == 0
+    seen = torch.zeros(ROWS)
+    for step in range(100):
+        ending = torch.randperm(robots, generator=draw)[:512]
+        chance = torch.tensor(success)[levels["row"][ending]]
+        won = torch.rand(512, generator=draw) < chance
+        teacher.tell(ids[ending], won, won)
+        ids[ending], levels[ending] = teacher.ask(512)
+        if step >= 40:
+            seen += levels["row"].bincount(minlength=ROWS)
+    torch.testing.assert_close(
+        seen.double() / seen.sum(), stationary(success), atol=0.01, rtol=0.05
+    )
+    speed = teacher.log()["drawn"]["speed"].values()
+    assert max(speed) < 1.1 * min(speed)
+
+
+def test_rows_move_as_of_one_robot_after_another() -> None:
+    """Two students, batches of three sizes, of which half of one never comes back."""
+    curriculum = RowsCurriculum(SPACE, start=1, lower=0.3, upper=0.7)
+    luck, queues = random.Random(0), ([], [])
+    for update in range(60):
+        batch = curriculum.propose(Student(), (6, 4, 9)[update % 3], [Streams(0, update)] * 2)
+        rows = batch.levels["row"]
+        for queue, own in zip(queues, rows.tolist(), strict=True):
+            for row in own:
+                expected = queue.pop(0) if queue else "first"
+                assert row == expected or (expected == "first" and row <= 1) or expected == "any"
+        told = torch.tensor([[luck.choice([0.1, 0.5, 0.8, 1.0]) for _ in own] for own in rows])
+        came = slice(0, 3 if update == 7 else None)
+        curriculum.observe(Student(), batch[:, came], reached(told[:, came], told[:, came]))
+        for queue, own, of in zip(queues, rows[:, came].tolist(), told[:, came], strict=True):
+            for row, one in zip(own, of.tolist(), strict=True):
+                move = 1 if one >= 0.7 else -1 if one < 0.3 else 0
+                queue.append("any" if row + move == ROWS else max(row + move, 0))
+    assert rows.max() == ROWS - 1 and any("any" in queue for queue in queues)
+    log = curriculum.log()
+    assert log["mean_row"] == rows.double().mean(1).tolist()
+    assert sum(map(sum, log["histogram"])) == 2 * (20 * 19 - 1)
+
+
+@pytest.mark.parametrize(
+    ("space", "options", "message"),
+    [
+        (SPACE, {"row": "level"}, "^row=level: unknown; there are: speed, row$"),
+        (SPACE, {"lower": 0.6}, "^lower=0.6: must be at most upper=0.5$"),
+        (SPACE, {"start": -1}, "^start=-1: input should be"),
+        (
+            prl.Parameters({"row": (0.0, 1.0)}, bins=1),
+            {},
+            "^row=row: has a single row; give it bins$",
+        ),
+    ],
+)
+def test_what_cannot_be_is_named(space: Any, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(prl.ArgumentError, match=message):
+        RowsCurriculum(space, **options)
+
+
+def test_of_whole_numbers_that_share_a_row_there_is_a_warning() -> None:
+    space = prl.Parameters({"row": range(10)})
+    with pytest.warns(UserWarning, match=r"^row: 10 whole numbers in 8 rows; bins={'row': 10} "):
+        RowsCurriculum(space)
+    # The first axis, unless one is called so.
+    curriculum = RowsCurriculum(prl.Parameters({"a": (0.0, 1.0), "b": (0.0, 1.0)}, bins=4), start=0)
+    levels = curriculum.propose(Student(), 64, [Streams(0)]).levels
+    assert levels["a"].max() < 0.25 and levels["b"].max() > 0.75
