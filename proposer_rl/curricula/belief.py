@@ -60,7 +60,7 @@ WIDEST = 24  # inputs; more are projected to as many
 STEPS, CLOSE = 12, 1e-4  # of Newton's method, and the change of log odds at which it ends
 LEAP = 3.0  # of log odds in one of its steps, at most
 SURE = 1e-3  # least curvature that an episode adds, p (1 - p)
-REMEMBERED = "mean", "precision", "own", "unknown", "apart"
+REMEMBERED = "mean", "precision", "own", "seen", "apart"
 
 
 class Belief:
@@ -105,7 +105,7 @@ class Belief:
         self._apart = torch.tensor(OWN, dtype=torch.float64)  # the variance among items
         self._expected = torch.zeros(items, dtype=torch.float64) if expected is None else expected
         self._own = self._expected
-        self._unknown = torch.ones_like(self._own)  # the part of that variance which is left
+        self._seen = torch.zeros_like(self._own)  # the precision of what was seen of each
         self._covariance: Tensor | None = None
 
     def grow_older(self, batches: float = 1.0) -> None:
@@ -119,7 +119,8 @@ class Belief:
         self._mean = torch.linalg.solve(self._precision, old * (precision @ (back @ self._mean)))
         left = 0.5 ** (age / LASTING)
         self._own = self._expected + left * (self._own - self._expected)
-        self._unknown = 1 - left**2 * (1 - self._unknown)
+        known = left**2 * self._apart * self._seen / (1 + self._apart * self._seen)
+        self._seen = known / (1 - known) / self._apart
         self._covariance = None
 
     def observe(
@@ -148,7 +149,7 @@ class Belief:
                 won / counts,
                 inputs.new_empty(len(items), inputs.shape[1]).index_copy(0, row, inputs),
             )
-            own, doubt = self._own[items], self._apart * self._unknown[items]
+            own, doubt = self._own[items], self._doubt(items)
         phi, prior, precision = self._columns(inputs), self._mean, self._precision
         z, mean, u = phi @ prior, prior, own
         for _ in range(STEPS):
@@ -170,9 +171,11 @@ class Belief:
         self._precision = precision + _curvature(phi, bend / (1 + bend * doubt))
         if items is not None:
             self._own = self._own.index_copy(0, items, u)
-            left = self._unknown[items] / (1 + bend * doubt)
-            self._unknown = self._unknown.index_copy(0, items, left)
-            square = (u - self._expected[items]).square() + self._apart * left
+            # Where all answers are alike, the curvature at the maximum says far too little.
+            share = (counts * labels + 0.5) / (counts + 1)
+            seen = torch.maximum(bend, counts * _bend(share))
+            self._seen = self._seen.index_add(0, items, seen)
+            square = (u - self._expected[items]).square() + self._doubt(items)
             moved = (square - self._apart).sum() / (STEADY + len(items))  # a step of EM
             self._apart = self._apart + moved
 
@@ -188,7 +191,7 @@ class Belief:
         phi = self._columns(inputs)
         z, variance = phi @ self._mean, ((phi @ self._covariance) * phi).sum(-1)
         if items is not None:
-            z, variance = z + self._own[items], variance + self._apart * self._unknown[items]
+            z, variance = z + self._own[items], variance + self._doubt(items)
         return (z / (1 + math.pi / 8 * variance).sqrt()).sigmoid()
 
     def draw(self, inputs: Tensor, items: Tensor, generator: torch.Generator) -> Tensor:
@@ -205,8 +208,7 @@ class Belief:
         factor = torch.linalg.cholesky(self._precision).mT
         noise = torch.linalg.solve_triangular(factor, normal(len(factor), 1), upper=True)
         mean = self._mean + noise[:, 0]
-        doubt = self._apart * self._unknown[items]
-        own = self._own[items] + doubt.sqrt() * normal(len(items))
+        own = self._own[items] + self._doubt(items).sqrt() * normal(len(items))
         return (self._columns(inputs) @ mean + own).sigmoid()
 
     def state_dict(self) -> dict[str, Any]:
@@ -218,6 +220,10 @@ class Belief:
         for name in REMEMBERED:
             setattr(self, f"_{name}", state[name])
         self._covariance = None
+
+    def _doubt(self, items: Tensor) -> Tensor:
+        """Returns the variances of what is items' own, float64 [n]."""
+        return self._apart / (1 + self._apart * self._seen[items])
 
     def _columns(self, inputs: Tensor) -> Tensor:
         """Returns the columns of inputs [n, D]: [n, F]."""

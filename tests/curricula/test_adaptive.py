@@ -312,7 +312,7 @@ def test_a_belief_gets_what_is_known_of_levels() -> None:
 
 
 def test_items_are_remembered_one_by_one() -> None:
-    """Of 5,000 items without features those that were solved are the way."""
+    """Of 5,000 items without features those that failed are hardly on the way."""
     space = prl.Items(5000, target=list(range(20)))
     curriculum = AdaptiveMixture(space, space.target)
 
@@ -321,10 +321,12 @@ def test_items_are_remembered_one_by_one() -> None:
         return {"return": won, "success": won, "episodes": torch.full_like(won, 8)}
 
     seen = [batch.levels["item"][0] for batch, _ in teach(curriculum, odd, 30, 256)]
-    batch, log = following(curriculum, 256)
+    batch, log = following(curriculum, 2048)
     arm, item, p = batch.notes["arm"][0], batch.levels["item"][0], batch.notes["predicted"][0]
     known = torch.isin(item, torch.cat(seen))
-    assert float((item[known & (arm == WAY)] % 2).float().mean()) > 0.9
+    failed = known & (item % 2 == 0)
+    way, uniform = (float(failed[arm == one].double().mean()) for one in (WAY, UNIFORM))
+    assert way < 0.7 * uniform  # of what failed a few are tried again
     assert p[known & (item % 2 == 1)].mean() > p[~known].mean() > p[known & (item % 2 == 0)].mean()
     assert (item[arm == TARGET] < 20).all()
     assert log["shares"]["way"][0] > 0

@@ -103,7 +103,7 @@ def test_a_group_weighs_as_much_as_its_answers() -> None:
     first = torch.cat([torch.arange(int(n)) for n in counts])
     labels = (first < (won * counts)[row] - 1e-6).double()
     answers.observe(x[row], labels, items[row])
-    for name in ("_mean", "_precision", "_own", "_unknown"):
+    for name in ("_mean", "_precision", "_own", "_seen"):
         torch.testing.assert_close(getattr(groups, name), getattr(answers, name))
 
 
@@ -117,7 +117,7 @@ def test_draws_are_of_the_posterior() -> None:
     z = torch.stack([belief.draw(x, items, generator).logit() for _ in range(1500)])
     phi = belief._columns(x)
     variance = ((phi @ belief._covariance) * phi).sum(-1)
-    variance = variance + belief._apart * belief._unknown[items]
+    variance = variance + belief._doubt(items)
     assert torch.allclose(z.mean(0), phi @ belief._mean + belief._own[items], atol=0.1)
     assert torch.allclose(z.var(0), variance, rtol=0.15)
 
