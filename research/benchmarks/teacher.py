@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from multiprocessing import get_context
 
 import torch
 
 from proposer_rl import curricula
 from proposer_rl.teaching import Items, Parameters, Teacher
+from research.benchmarks.meta import peak_memory
 from research.benchmarks.peer import said_by
 from research.benchmarks.results import Options, Result, Row, Spread
 from research.benchmarks.syllabus_peer import __file__ as SYLLABUS
@@ -19,6 +22,7 @@ TARGETS = {"one by one": 20.0, f"{MANY} at once": 2.0}  # microseconds of a leve
 RANGES, BATCH = (2, 4, 8, 12), 384
 ITEMS, FEATURES = 100_000, 16
 OF_A_PROPOSAL, OF_A_PAIR, OF_AN_ITEM = 0.030, 60e-6, 5e-6  # targets, seconds
+OF_MEMORY, STEPS = 200e6 / 2**30, 120  # target, GiB, after so many steps
 
 
 def teacher_calls(options: Options) -> Result:
@@ -46,7 +50,7 @@ def teacher_calls(options: Options) -> Result:
         )
         for name in TARGETS
     ]
-    rows += adaptive_mixture(options)
+    rows += adaptive_mixture(options) + memory(options)
     if options.syllabus is not None:
         rows += beside_syllabus(options.syllabus, 16 if options.tiny else 256, options.repeats)
     return Result(rows)
@@ -59,16 +63,14 @@ def adaptive_mixture(options: Options) -> list[Row]:
     ways: dict[str, Callable[[], None]] = {}
     per, targets = {}, {}
     for size in RANGES[:1] if options.tiny else RANGES:
-        names = [f"x{i}" for i in range(size)]
-        space = Parameters(dict.fromkeys(names, (0.0, 1.0)), target={"x0": (0.8, 1.0)}, bins=1)
+        space = ranges(size)
         name = f"a proposal of {BATCH} levels with {size} ranges"
         ways[name] = partial(_batch, Teacher(curricula.adaptive_mixture(), space), BATCH)
         per[name], targets[name] = 1, OF_A_PROPOSAL
         name = f"ask and tell with {size} ranges, one by one, each"
         ways[name] = partial(_one_by_one, Teacher(curricula.adaptive_mixture(), space), count)
         per[name], targets[name] = count, OF_A_PAIR
-    known = torch.rand(items, FEATURES, generator=torch.Generator().manual_seed(0))
-    prompts = Items(items, features=known, target=range(items // 100))
+    prompts = prompts_of(items)
     name = f"a step of {count} of {items:,} items with {FEATURES} features"
     ways[name] = partial(_batch, Teacher(curricula.adaptive_mixture(), prompts), count)
     per[name], targets[name] = 1, OF_AN_ITEM * items
@@ -88,6 +90,55 @@ def adaptive_mixture(options: Options) -> list[Row]:
         )
         for name in ways
     ]
+
+
+def memory(options: Options) -> list[Row]:
+    """Memory of a teacher and its space, each in a process of its own."""
+    items, steps = (500, 2) if options.tiny else (ITEMS, STEPS)
+    size = RANGES[-1]
+    kinds: dict[str, tuple[Callable[[int], Items | Parameters], int, int]] = {
+        f"{size} ranges": (ranges, size, BATCH),
+        f"{items:,} items with {FEATURES} features": (prompts_of, items, MANY),
+    }
+    rows = []
+    for name, given in kinds.items():
+        with ProcessPoolExecutor(1, get_context("spawn")) as alone:
+            grown = alone.submit(grown_memory, *given, steps).result()
+        rows.append(
+            Row(
+                f"adaptive mixture, memory after {steps} steps with {name}",
+                "beyond what importing takes",
+                Spread.of([grown / 2**30]),
+                "GiB",
+                target=OF_MEMORY,
+                at_most=True,
+            )
+        )
+    return rows
+
+
+def grown_memory(
+    make: Callable[[int], Items | Parameters], size: int, count: int, steps: int
+) -> int:
+    """Bytes by which the peak of this process grows while a teacher is made and teaches."""
+    before = peak_memory()
+    with threads(1):
+        teacher = Teacher(curricula.adaptive_mixture(), make(size))
+        for _ in range(steps):
+            _batch(teacher, count)
+    return peak_memory() - before
+
+
+def ranges(size: int) -> Parameters:
+    """So many ranges, of which one has a target."""
+    names = [f"x{i}" for i in range(size)]
+    return Parameters(dict.fromkeys(names, (0.0, 1.0)), target={"x0": (0.8, 1.0)}, bins=1)
+
+
+def prompts_of(items: int) -> Items:
+    """So many items with random features."""
+    known = torch.rand(items, FEATURES, generator=torch.Generator().manual_seed(0))
+    return Items(items, features=known, target=range(items // 100))
 
 
 def beside_syllabus(python: str, count: int, repeats: int) -> list[Row]:
