@@ -45,6 +45,10 @@ from proposer_rl.curricula.problem_proposer import (
     SampledFirstOrderProposer as SampledFirstOrderProposer,
 )
 from proposer_rl.curricula.progress import LearningProgressCurriculum as LearningProgressCurriculum
+from proposer_rl.curricula.prompts import AdaptiveDifficulty as AdaptiveDifficulty
+from proposer_rl.curricula.prompts import ArcLengthFilter as ArcLengthFilter
+from proposer_rl.curricula.prompts import BetaSampling as BetaSampling
+from proposer_rl.curricula.prompts import CategoryBandit as CategoryBandit
 from proposer_rl.curricula.proposer import ProposerCurriculum as ProposerCurriculum
 from proposer_rl.curricula.proposer import ProposerTrainer as ProposerTrainer
 from proposer_rl.curricula.replay import ReplayCurriculum as ReplayCurriculum

@@ -61,6 +61,7 @@ SOON, LATER = 6.0, 20.0  # half-lives in batches: of sums, and of b where succes
 FEW = 16  # levels, of which fewer are counted as a part of a batch
 RARE = 0.02  # share of successes, below which the belief learns from returns, too
 LEARNABLE = 0.2  # of the bonus, in squared distances per input
+ITEMS_LEARNABLE, ITEMS_TIMES = 1.0, 4  # that, and times as many candidates, where levels come back
 NEAR = 0.025  # standard deviation of what is added between two levels, in shares of a range
 AT_ONCE = 64  # levels of the way that are assigned to draws of the target together
 FORBIDDEN = 1e3  # cost of a candidate that is not mastered
@@ -138,6 +139,8 @@ class AdaptiveMixture(Curriculum):
             for name in ("return", "success")
             if name in outcome.keys()
         }
+        if "episodes" in outcome.keys() and "rollout" not in outcome.keys():
+            results["counts"] = outcome["episodes"].double().cpu()  # that the means are of
         self._inbox.put(batch, **batch.notes.exclude("number", "place", "size"), **results)
 
     def log(self) -> dict[str, Any]:
@@ -176,7 +179,11 @@ class AdaptiveMixture(Curriculum):
         one = self._space.sample(1, torch.Generator())
         items = 0 if self._items(one) is None else self._space.size
         width = self._inputs(one).shape[-1]
-        made = (Belief(width, items, half_life=self._half_life) for _ in range(students))
+        expected = getattr(self._space, "expected", None)
+        made = (
+            Belief(width, items, expected=expected, half_life=self._half_life)
+            for _ in range(students)
+        )
         self._beliefs = list(made)
         self._sums = self._sums.new_zeros(students, *self._sums.shape[1:])
         self._best = self._best.new_zeros(students)
@@ -189,11 +196,11 @@ class AdaptiveMixture(Curriculum):
             returns = seen["return"]
             success, labels = self._labels(returns, seen.get("success", None))
             batches = labels.shape[1] / max(int(seen["size"][0, 0]), FEW)  # that have passed
-            which = _each(seen.get("items", None), len(labels))
-            every = zip(self._beliefs, seen["inputs"], labels, which, strict=True)
-            for belief, x, label, own in every:
+            which, counts = (_each(seen.get(n, None), len(labels)) for n in ("items", "counts"))
+            every = zip(self._beliefs, seen["inputs"], labels, which, counts, strict=True)
+            for belief, x, label, own, count in every:
                 belief.grow_older(batches)
-                belief.observe(x, label, own)
+                belief.observe(x, label, own, count)
             self._seen.append((seen["predicted"], success))
             of = {
                 "levels": torch.ones_like(labels),
@@ -276,15 +283,19 @@ class AdaptiveMixture(Curriculum):
         """Returns levels [n] that are mastered, and near to the target."""
         goal = self._space if self._target is None else self._target
         targets = goal.sample(count, draw)
-        levels = self._candidates(k, self._times * count, targets, draw)
+        times = self._times * (ITEMS_TIMES if hasattr(self._space, "items") else 1)
+        levels = self._candidates(k, times * count, targets, draw)
         goals, x, items = self._inputs(targets), self._inputs(levels), self._items(levels)
-        p = self._beliefs[k].predict(x, items)
+        belief = self._beliefs[k]
+        # What comes back is explored by draws, which differ where little or nothing new is known.
+        p = belief.predict(x) if items is None else belief.draw(x, items, draw)
         allowed = p >= p.topk(count).values[-1].clamp(max=self._delta)
-        extra = torch.where(allowed, -LEARNABLE * 4 * p * (1 - p), FORBIDDEN)
+        bonus = LEARNABLE if items is None else ITEMS_LEARNABLE
+        extra = torch.where(allowed, -bonus * 4 * p * (1 - p), FORBIDDEN)
         chosen = []
         for start in range(0, count, AT_ONCE):
             end = min(start + AT_ONCE, count)
-            few = slice(self._times * start, self._times * end)
+            few = slice(times * start, times * end)
             far = torch.cdist(goals[start:end], x[few]).square() / max(x.shape[1], 1)
             chosen.append(few.start + assigned(far + extra[few]))
         self._last[str(k)] = levels[torch.cat(chosen)]
@@ -293,6 +304,11 @@ class AdaptiveMixture(Curriculum):
     def _candidates(self, k: int, count: int, targets: Levels, draw: torch.Generator) -> Levels:
         """Returns levels [n] of the space and, if it can tell, between the last way and targets."""
         space: Any = self._space
+        if hasattr(space, "items"):  # none twice, where there are enough
+            order = torch.randperm(space.size, generator=draw)
+            places = order.repeat(-(-count // space.size))[:count]
+            made: Levels = space.generate(places[None], [draw])[0]
+            return made
         if not hasattr(space, "between"):
             return space.sample(count, draw)
         half = count // 2

@@ -201,7 +201,8 @@ class Belief:
     def _tell_apart(self, items: Tensor) -> None:
         """Moves the variance among items towards that of some, by a step of EM."""
         square = (self._own - self._expected)[items].square() + self._doubt[items]
-        self._apart += (square - self._apart).sum() / (STEADY + len(items))
+        moved = (square - self._apart).sum() / (STEADY + len(items))
+        self._apart = self._apart + moved
 
     def _columns(self, inputs: Tensor) -> Tensor:
         """Returns the columns of inputs [n, D]: [n, F]."""

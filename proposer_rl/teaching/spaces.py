@@ -21,6 +21,13 @@ from proposer_rl.settings import ArgumentError, plain, shown, whole
 from proposer_rl.task import Distribution, Levels, space_features
 from proposer_rl.tasks.parameters import SEED, Bins, Law, ParameterSpace
 from proposer_rl.tasks.ranges import python_values, read_line, read_part, target_in_file
+from proposer_rl.teaching.tables import (
+    expected_log_odds,
+    few_columns,
+    item_table,
+    number_table,
+    rate_columns,
+)
 
 DRAWN = "level"  # the entry that holds a generator's tensors
 Ranges = Mapping[str, Any]
@@ -72,7 +79,7 @@ class LevelSpace:
             return space_features(self, levels)
         shape = levels.shape
         with callers_state():
-            known = _feature_table(self._features(self.given(levels.reshape(-1))))
+            known = number_table(self._features(self.given(levels.reshape(-1))))
         if known.ndim != 2 or len(known) != shape.numel():
             raise ArgumentError(
                 f"features={list(known.shape)}: must give a row of numbers for each of "
@@ -246,13 +253,27 @@ class Items(LevelSpace):
 
     Args:
         count: number N of items.
-        features: numbers that tell what items are like, float [N, D], as a tensor, an array or a
-            table; None for their places alone.
+        features: what items are like, such as source, length, difficulty or an embedding: numbers
+            [N, D] on any scale as a tensor or an array; or a table, columns by name, or rows, in
+            which texts are categories. None for their places alone.
+        pass_rates: how often another model, or this one before, solves each, from 0 to 1, [N]; NaN
+            where that is not known. A belief begins with them, and outgrows them.
         target: places of those that are to be mastered; None for no target.
         named: further distributions like ``target``, by name.
 
     Raises:
-        ArgumentError: if there is no item, or not a row of features for each.
+        ArgumentError: if there is no item, or not a row of features or a pass rate for each.
+
+    Attributes:
+        categories: the number of each item's category, int64 [N]; None where no feature is a text.
+        pass_rates: float64 [N], or None.
+        expected: log odds of success on each by its pass rate, float64 [N]; None without any.
+
+    Example:
+        >>> sums = {"source": ["add", "add", "times"], "digits": [1, 6, 2]}
+        >>> items = Items(3, features=sums, pass_rates=[0.9, 0.1, float("nan")])
+        >>> items.categories, items.inputs(items.generate(torch.tensor([0, 1]), [])).shape
+        (tensor([0, 0, 1]), torch.Size([2, 5]))
     """
 
     @own_state()
@@ -261,18 +282,25 @@ class Items(LevelSpace):
         count: int,
         *,
         features: Any = None,
+        pass_rates: Any = None,
         target: Sequence[int] | None = None,
         named: Mapping[str, Sequence[int]] | None = None,
     ) -> None:
         count = whole("count", count, 1)
         self.size = count
         self.axes = {"item": range(count)}
-        lines = torch.arange(count).unsqueeze(-1) if features is None else _feature_table(features)
+        lines, self.categories = item_table(
+            torch.arange(count).unsqueeze(-1) if features is None else features
+        )
         if lines.ndim != 2 or len(lines) != count or not lines.float().isfinite().all():
             raise ArgumentError(
                 f"features={list(lines.shape)}: must have a row of finite numbers for each item"
             )
-        self._known = 0 if features is None else lines.shape[1]
+        self.pass_rates = None if pass_rates is None else _rates(pass_rates, count)
+        self.expected = None if self.pass_rates is None else expected_log_odds(self.pass_rates)
+        known = [torch.zeros(count, 0)] if features is None else [few_columns(lines)]
+        known += [] if self.pass_rates is None else [rate_columns(self.pass_rates)]
+        self._inputs = torch.cat(known, 1)
         low, high = lines.amin(0), lines.amax(0)
         self.coordinates = (2 * (lines - low) / (high - low).clamp_min(1e-12) - 1).float()
         parts: dict[str, _SomeItems] = {}
@@ -291,12 +319,13 @@ class Items(LevelSpace):
     @property
     def description(self) -> dict[str, Any]:
         """Returns how many there are, a hash of their features, and the places of the target."""
-        known = self.coordinates.contiguous().numpy().tobytes()
+        rates = {} if self.pass_rates is None else {"pass_rates": _hash(self.pass_rates)}
         places = {name: one.places.tolist() for name, one in self._parts.items()}
         return {
             **super().description,
             "count": self.size,
-            "features": hashlib.sha256(known).hexdigest()[:16],
+            "features": _hash(self.coordinates),
+            **rates,
             **places,
         }
 
@@ -305,8 +334,12 @@ class Items(LevelSpace):
         return self.coordinates[levels["item"]]
 
     def inputs(self, levels: TensorDictBase) -> Tensor:
-        """Returns what a belief knows of items, float32 [*B, D]; a place in a list says nothing."""
-        return self.locate(levels)[..., : self._known]
+        """Returns what a belief knows of items, float32 [*B, D]: ranks, from -1 to 1.
+
+        Of more than 24 features they are those of the first 24 principal components. A place in a
+        list says nothing, so that D is 0 without features and pass rates.
+        """
+        return self._inputs[levels["item"]]
 
     def items(self, levels: TensorDictBase) -> Tensor:
         """Returns the places of items, int64 [*B], each with a memory of its own."""
@@ -432,14 +465,21 @@ def _taken(name: str, levels: Any, count: int) -> Levels:
     return TensorDict({DRAWN: levels}, [count]) if isinstance(levels, Tensor) else levels
 
 
-def _feature_table(features: Any) -> Tensor:
-    """Returns numbers [N, D], whatever they are given as."""
-    array = hasattr(features, "__array__") and not isinstance(features, Tensor)
+def _rates(given: Any, count: int) -> Tensor:
+    """Returns pass rates, float64 [N]."""
     try:
-        table = torch.as_tensor(np.array(features) if array else features)
+        rates = torch.as_tensor(np.array(given, dtype=np.float64))
     except (TypeError, ValueError, RuntimeError) as error:
-        raise ArgumentError(f"features={shown(features)}: must be numbers [N, D]") from error
-    return table if table.is_floating_point() else table.long()  # small integers would overflow
+        raise ArgumentError(f"pass_rates={shown(given)}: must be numbers [N]") from error
+    if rates.shape != (count,):
+        raise ArgumentError(f"pass_rates={list(rates.shape)}: must be one for each of {count}")
+    if (wrong := rates[(rates < 0) | (rates > 1)]).numel():
+        raise ArgumentError(f"pass_rates={wrong[0]:g}: must be from 0 to 1, or NaN")
+    return rates
+
+
+def _hash(numbers: Tensor) -> str:
+    return hashlib.sha256(numbers.contiguous().numpy().tobytes()).hexdigest()[:16]
 
 
 def _item_places(name: str, given: Any, count: int) -> list[int]:

@@ -74,7 +74,7 @@ def test_what_is_not_seen_any_more_is_forgotten() -> None:
     x, items = torch.zeros(30, 1).double(), torch.zeros(30).long()
     belief.observe(x, torch.ones(30).double(), items)
     sure = float(belief.predict(x[:1], items[:1]))
-    for _ in range(60):
+    for _ in range(300):
         belief.grow_older()
     assert sure > 0.85
     assert float(belief.predict(x[:1], items[:1])) == pytest.approx(0.5, abs=0.02)

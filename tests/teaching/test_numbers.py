@@ -247,7 +247,15 @@ NO_ITEMS: list[tuple[Any, dict[str, Any], str]] = [
     (4, {"target": np.array([True, False])}, r"target=\[True, False\]: must be places"),
     (4, {"target": np.array([1.0])}, r"target=\[1.0\]: must be places from 0 to 3"),
     (2, {"features": np.array([[HUGE], [0]])}, r"features=\[2, 1\]: .* finite"),
-    (1, {"features": pd.DataFrame({"a": ["x"]})}, "features=a 0 x: must be numbers"),
+    (1, {"features": pd.DataFrame({"a": [{}]})}, "features.*: must be numbers"),
+    (2, {"features": {"a": ["x", "y"], "b": [1]}}, r"features=\['a', 'b'\]: .* of one length"),
+    (2, {"features": {"a": ["x", "y"], "b": [1, {}]}}, "features.b=.*: must be numbers or texts"),
+    (2, {"features": {"a": ["x", "y"], "b": [1, NAN]}}, r"features=\[2, 3\]: .* finite"),
+    (2, {"features": [["a", 1], ["b"]]}, "features: must have rows of one length"),
+    (300, {"features": [*map(str, range(300))]}, "features.0: has 300 texts that differ; .* 256"),
+    (2, {"pass_rates": [0.5]}, r"pass_rates=\[1\]: must be one for each of 2"),
+    (2, {"pass_rates": [0.5, 1.5]}, "pass_rates=1.5: must be from 0 to 1, or NaN"),
+    (2, {"pass_rates": "often"}, "pass_rates='often': must be numbers"),
 ]  # fmt: skip
 NO_LEVELS: list[tuple[Any, dict[str, Any], str]] = [
     (lambda n: np.array(["a"] * n), {}, "draw=ndarray: must give a tensor, a tensordict"),

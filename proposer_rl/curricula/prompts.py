@@ -1,0 +1,429 @@
+"""Curricula of items that come back, such as prompts, by how many of G answers were right.
+
+Each draws from the items of a data set, or from the bins of another space, and keeps a few numbers
+of each. m of the G answers to an item were right, whose chance of one is p. An outcome's success is
+m / G and its ``episodes`` are G; graded answers give a sum m of their grades. Groups teach only
+where they are mixed, which has the probability 1 - p^G - (1 - p)^G.
+
+None of them has a floor of exploration: what is believed to be out of reach is hardly drawn again.
+See :class:`~proposer_rl.curricula.AdaptiveMixture` for one that is.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.outcome_model import calibration
+from proposer_rl.curricula.student import Student
+from proposer_rl.meta.actions import systematic_draw
+from proposer_rl.settings import ArgumentError, Decay, Positive, Share, checked
+from proposer_rl.streams import Streams
+from proposer_rl.task import Space, refuse_single_bin
+
+LOGGED = 100  # batches at most, whose predictions a log is about
+PRIOR = math.pi**2 / 16 - 0.5  # variance of the arc length of a probability that is uniform
+
+
+class ItemCurriculum(Curriculum):
+    """Draws items by numbers of each, which it moves by what answers have shown.
+
+    A subclass says which numbers these are at first, what is drawn, and what is learnt.
+
+    Args:
+        space: of N items, or with N bins.
+    """
+
+    reads = ("success",)
+    remembers: ClassVar[tuple[str, ...]] = ("_inbox", "numbers")
+
+    def __init__(self, space: Space) -> None:
+        refuse_single_bin(space)
+        self.space = space
+        self.numbers: dict[str, Tensor] = {}  # each [K, ...]; none before the first proposal
+        self._inbox = Inbox()
+        self._seen: deque[tuple[Tensor, Tensor]] = deque(maxlen=LOGGED)
+
+    @abstractmethod
+    def first_numbers(self, students: int) -> dict[str, Tensor]:
+        """Returns the numbers of items before anything is known, by name, each [K, ...]."""
+
+    @abstractmethod
+    def draw(self, own: dict[str, Tensor], count: int, generator: torch.Generator) -> Tensor:
+        """Draws places of items of one student, int64 [n].
+
+        Args:
+            own: the student's numbers.
+            count: number n of items, perhaps more than there are.
+            generator: of the CPU.
+        """
+
+    @abstractmethod
+    def learn(self, own: dict[str, Tensor], seen: dict[str, Tensor]) -> None:
+        """Moves numbers of one student, in place, by a batch.
+
+        Args:
+            own: the student's numbers.
+            seen: ``place`` of the items, int64 [n], ``success`` and ``count`` of answers, float64.
+        """
+
+    def expected(self, own: dict[str, Tensor]) -> Tensor | None:
+        """Returns the expected success on each item, float64 [N], if there is such a belief."""
+        return None
+
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Returns items [K, n], each once where there are enough."""
+        self.numbers = self.numbers or self.first_numbers(len(streams))
+        self._take_in()
+        rows = [self._own(k) for k in range(len(streams))]
+        draws, levels = ([s.generator(key) for s in streams] for key in ("choices", "levels"))
+        each = zip(rows, draws, strict=True)
+        places = torch.stack([self.draw(own, count, g) for own, g in each])
+        notes = {"item": places}
+        if (guesses := [self.expected(own) for own in rows])[0] is not None:
+            notes["predicted"] = torch.stack(guesses).gather(1, places)  # type: ignore[arg-type]
+        return self._inbox.batch(self.space.generate(places, levels), **notes)
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Keeps what came of items, which the next proposal learns from."""
+        self._inbox.check(batch, outcome)
+        if "success" not in outcome.keys():
+            raise ValueError(f"{type(self).__name__}: the outcome has no success")
+        success = outcome["success"].double().cpu()
+        counts = torch.ones_like(success)
+        if "rollout" not in outcome.keys():  # whose success is that of its first episode
+            counts = outcome.get("episodes", counts).double().cpu()
+        notes = batch.notes.exclude("number", "place", "size")
+        self._inbox.put(batch, **notes, success=success, count=counts)
+
+    def log(self) -> dict[str, Any]:
+        """Returns how right the belief was, as of the adaptive mixture, if there is one."""
+        if not self._seen:
+            return {}
+        predicted, success = (torch.cat(one, 1) for one in zip(*self._seen, strict=True))
+        self._seen.clear()
+        return calibration(predicted, success)
+
+    def _take_in(self) -> None:
+        for came in self._inbox.take():
+            for k in range(len(came)):
+                seen = {name: came[name][k] for name in ("item", "success", "count")}
+                self.learn(self._own(k), seen)
+            if "predicted" in came.keys():
+                self._seen.append((came["predicted"], came["success"]))
+
+    def _own(self, k: int) -> dict[str, Tensor]:
+        """Returns views of the numbers of a student."""
+        return {name: each[k] for name, each in self.numbers.items()}
+
+
+class BetaSampling(ItemCurriculum):
+    """MoPPS: the items nearest to a success by a draw from a Beta distribution of each.
+
+    Qu et al. 2025 (arXiv 2507.04632): of an item that was drawn,
+
+        a <- decay a + (1 - decay) + m,    b <- decay b + (1 - decay) + G - m,
+
+    both 1 at first; those are drawn whose draws from Beta(a, b) are the nearest to ``target``.
+
+    Args:
+        space: see :class:`ItemCurriculum`.
+        decay: part of what was known that is kept at each observation.
+        target: success that is looked for.
+    """
+
+    @checked
+    def __init__(self, space: Space, *, decay: Share = 0.5, target: Share = 0.5) -> None:
+        super().__init__(space)
+        self._decay, self._target = decay, target
+
+    def first_numbers(self, students: int) -> dict[str, Tensor]:
+        """Returns a and b, float64 [K, N]."""
+        one = torch.ones(students, self.space.size, dtype=torch.float64)
+        return {"a": one, "b": one.clone()}
+
+    def draw(self, own: dict[str, Tensor], count: int, generator: torch.Generator) -> Tensor:
+        """Draws the items nearest to the target."""
+        a, b = (torch._standard_gamma(own[name], generator=generator) for name in ("a", "b"))
+        return nearest(a / (a + b) - self._target, count, generator)
+
+    def learn(self, own: dict[str, Tensor], seen: dict[str, Tensor]) -> None:
+        """Moves the Beta distributions of the items that were seen."""
+        items, answers, right = per_item(seen)
+        for name, number in (("a", right), ("b", answers - right)):
+            own[name][items] = self._decay * own[name][items] + 1 - self._decay + number
+
+    def expected(self, own: dict[str, Tensor]) -> Tensor:
+        """Returns a / (a + b)."""
+        return own["a"] / (own["a"] + own["b"])
+
+
+class AdaptiveDifficulty(ItemCurriculum):
+    """AdaRFT: the items whose difficulty is nearest to one that follows the reward.
+
+    Shi et al. 2025 (arXiv 2504.05520), with difficulties from 0 to 1, 1 less a pass rate: with r
+    the mean success of a batch,
+
+        T <- T + step tanh(sensitivity (r - target)),    within the difficulties there are,
+
+    which begins with the lowest.
+
+    Args:
+        space: of items with a pass rate each.
+        step: of T at most.
+        sensitivity: of T to the reward.
+        target: success that is looked for.
+
+    Raises:
+        ArgumentError: if items have no pass rates.
+    """
+
+    @checked
+    def __init__(
+        self,
+        space: Space,
+        *,
+        step: Positive = 0.5,
+        sensitivity: Positive = 2.0,
+        target: Share = 0.5,
+    ) -> None:
+        super().__init__(space)
+        rates: Tensor | None = getattr(space, "pass_rates", None)
+        if rates is None or rates.isnan().any():
+            found = "none" if rates is None else f"{int(rates.isnan().sum())} missing"
+            raise ArgumentError(f"pass_rates: {found}: this curriculum needs one of each item")
+        self._difficulty = 1 - rates
+        self._step, self._sensitivity, self._target = step, sensitivity, target
+
+    def first_numbers(self, students: int) -> dict[str, Tensor]:
+        """Returns the difficulty T, float64 [K, 1]."""
+        return {"difficulty": self._difficulty.min().repeat(students, 1)}
+
+    def draw(self, own: dict[str, Tensor], count: int, generator: torch.Generator) -> Tensor:
+        """Draws the items nearest to T."""
+        return nearest(self._difficulty - own["difficulty"], count, generator)
+
+    def learn(self, own: dict[str, Tensor], seen: dict[str, Tensor]) -> None:
+        """Moves T."""
+        reward = (seen["success"] * seen["count"]).sum() / seen["count"].sum()
+        moved = self._step * (self._sensitivity * (reward - self._target)).tanh()
+        low, high = self._difficulty.min(), self._difficulty.max()
+        own["difficulty"].add_(moved).clamp_(low, high)
+
+    def log(self) -> dict[str, Any]:
+        """Returns T of each student."""
+        return {name: each[:, 0].tolist() for name, each in self.numbers.items()}
+
+
+class CategoryBandit(ItemCurriculum):
+    """SEC: categories in shares by a value of each, and uniform items of these.
+
+    Chen et al. 2025 (arXiv 2505.14970): shares are softmax(Q / temperature), and with r the mean
+    size of an advantage in the answers of a category, TD(0) is
+
+        Q <- (1 - rate) Q + rate r,    0 at first.
+
+    Where advantages are divided by the deviation in their group, r is 2 sqrt(p (1 - p)) of a group
+    with a share p of successes. Groups need several answers.
+
+    Args:
+        space: of items with ``categories``.
+        rate: of learning.
+        temperature: of the shares.
+
+    Raises:
+        ArgumentError: if items have no categories.
+    """
+
+    @checked
+    def __init__(
+        self, space: Space, *, rate: Share = 0.5, temperature: Positive = 0.4
+    ) -> None:
+        super().__init__(space)
+        categories: Tensor | None = getattr(space, "categories", None)
+        if categories is None:
+            raise ArgumentError(
+                "features: have no texts: this curriculum needs a category of each item"
+            )
+        self._categories = categories
+        self._rate, self._temperature = rate, temperature
+
+    def first_numbers(self, students: int) -> dict[str, Tensor]:
+        """Returns the values Q, float64 [K, C]."""
+        size = int(self._categories.max()) + 1
+        return {"value": torch.zeros(students, size, dtype=torch.float64)}
+
+    def draw(self, own: dict[str, Tensor], count: int, generator: torch.Generator) -> Tensor:
+        """Draws categories systematically, and items of each without replacement."""
+        shares = (own["value"] / self._temperature).softmax(0)
+        drawn = systematic_draw(shares[None], count, [generator])[0]
+        places = torch.empty_like(drawn)
+        for category in drawn.unique():
+            members = (self._categories == category).nonzero().flatten()
+            these = drawn == category
+            order = nearest(torch.zeros(len(members)), int(these.sum()), generator)
+            places[these] = members[order]
+        return places
+
+    def learn(self, own: dict[str, Tensor], seen: dict[str, Tensor]) -> None:
+        """Moves the values of the categories that were seen."""
+        category, p = self._categories[seen["item"]], seen["success"]
+        zero = torch.zeros_like(own["value"])
+        number = zero.index_add(0, category, torch.ones_like(p))
+        reward = zero.index_add(0, category, 2 * (p * (1 - p)).sqrt()) / number.clamp(min=1)
+        own["value"].lerp_(reward, self._rate * (number > 0).double())
+
+    def log(self) -> dict[str, Any]:
+        """Returns the values of categories, of each student."""
+        return {name: each.tolist() for name, each in self.numbers.items()}
+
+
+class ArcLengthFilter(ItemCurriculum):
+    """Filters each item's arc length, psi = arcsin(sqrt(p)), and draws those near to a wanted one.
+
+    After ARCUS (arXiv 2609.38018). Whatever p is, the arc length z of m of G answers has the
+    variance 1 / (4 G + 2), and 1 / (2 G) where all or none were right, see :func:`arc_length`. A
+    Kalman filter of each item follows it; all of them move with one drift per batch, which is
+    filtered, too. Items are drawn without replacement in proportion to
+
+        (overlap of N(psi, variance) with N(wanted, width^2)) (1 - p^G - (1 - p)^G),
+
+    wanted being the lowest p at which a group is mixed with at least 1 - ``slack`` of the highest
+    probability.
+
+    Args:
+        space: see :class:`ItemCurriculum`.
+        noise: variance that an item's arc length gains in a batch.
+        drift_noise: that the drift gains.
+        width: of what is wanted.
+        slack: part of the mixed groups that harder items may cost.
+    """
+
+    @checked
+    def __init__(
+        self,
+        space: Space,
+        *,
+        noise: Share = 1e-4,
+        drift_noise: Share = 1e-6,
+        width: Positive = 0.15,
+        slack: Decay = 0.1,
+    ) -> None:
+        super().__init__(space)
+        self._noise, self._drift_noise = noise, drift_noise
+        self._width, self._slack = width, slack
+
+    def first_numbers(self, students: int) -> dict[str, Tensor]:
+        """Returns arc lengths and their variances [K, N], the drift and its variance, and G."""
+        shape = students, self.space.size
+        one = torch.ones(students, 1, dtype=torch.float64)
+        return {
+            "psi": torch.full(shape, math.pi / 4, dtype=torch.float64),
+            "variance": torch.full(shape, PRIOR, dtype=torch.float64),
+            "drift": 0 * one,
+            "drift_variance": self._drift_noise * one,
+            "answers": 2 * one,
+        }
+
+    def draw(self, own: dict[str, Tensor], count: int, generator: torch.Generator) -> Tensor:
+        """Draws items without replacement, by their scores."""
+        wanted = wanted_arc(float(own["answers"]), self._slack)
+        spread = own["variance"] + self._width**2
+        overlap = -(own["psi"] - wanted).square() / (2 * spread) - spread.log() / 2
+        score = overlap + mixed(self.expected(own), own["answers"]).clamp(min=1e-9).log()
+        waits = torch.empty_like(score).exponential_(generator=generator)
+        return nearest(waits.log() - score, count, generator, smallest=True)
+
+    def learn(self, own: dict[str, Tensor], seen: dict[str, Tensor]) -> None:
+        """Lets a batch pass, and moves the arc lengths of the items that were seen."""
+        items, answers, right = per_item(seen)
+        own["psi"].add_(own["drift"]).clamp_(0, math.pi / 2)
+        own["variance"].add_(self._noise).clamp_(max=PRIOR)
+        z, error = arc_length(right, answers)
+        off, both = z - own["psi"][items], own["variance"][items] + error
+        gain = own["variance"][items] / both
+        own["psi"][items] += gain * off
+        own["variance"][items] *= 1 - gain
+        own["drift_variance"].add_(self._drift_noise)
+        weight = (1 / both).sum()
+        part = own["drift_variance"] / (own["drift_variance"] + 1 / weight)
+        own["drift"].add_(part * (off / both).sum() / weight)
+        own["drift_variance"].mul_(1 - part)
+        own["answers"].fill_(max(float(answers.mean()), 2.0))
+
+    def expected(self, own: dict[str, Tensor]) -> Tensor:
+        """Returns the expectation of sin^2 of the arc lengths."""
+        return (1 - (-2 * own["variance"]).exp() * (2 * own["psi"]).cos()) / 2
+
+
+def per_item(seen: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns the items that were seen, each once, int64 [m], and their answers and right ones."""
+    items, row = seen["item"].unique(return_inverse=True)
+    none = torch.zeros(len(items), dtype=torch.float64)
+    answers = none.index_add(0, row, seen["count"])
+    return items, answers, none.index_add(0, row, seen["count"] * seen["success"])
+
+
+def nearest(
+    distances: Tensor, count: int, generator: torch.Generator, smallest: bool = False
+) -> Tensor:
+    """Returns places of the least distances, int64 [n], in a random order.
+
+    Equal ones are taken at random; each comes once, or as often as all do.
+
+    Args:
+        distances: float [N].
+        count: number n of places.
+        generator: of the CPU.
+        smallest: whether a sign counts; else the distance is from 0.
+    """
+    mixed_up = torch.randperm(len(distances), generator=generator)
+    keys = distances[mixed_up] if smallest else distances[mixed_up].abs()
+    rounds, rest = divmod(count, len(keys))
+    places = mixed_up[keys.argsort(stable=True)[:rest]]
+    places = torch.cat([*([mixed_up] * rounds), places])
+    return places[torch.randperm(count, generator=generator)]
+
+
+def mixed(p: Tensor, answers: Tensor | float) -> Tensor:
+    """Returns the probability that not all answers to an item are alike.
+
+    Args:
+        p: probability of a right one.
+        answers: number G of them.
+
+    Example:
+        >>> mixed(torch.tensor([0.0, 0.5, 0.9]), 2.0)
+        tensor([0.0000, 0.5000, 0.1800])
+    """
+    return 1 - p**answers - (1 - p) ** answers
+
+
+def arc_length(right: Tensor, answers: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the arc length that m right ones of G answers show, and its variance.
+
+    Args:
+        right: m, float64 [n].
+        answers: G, float64 [n].
+    """
+    all_alike = (right <= 0) | (right >= answers)
+    inner = ((right + 0.375) / (answers + 0.75)).clamp(0, 1).sqrt().asin()
+    ends = (right > 0).double() * math.pi / 2
+    error = torch.where(all_alike, 1 / (2 * answers), 1 / (4 * answers + 2))
+    return torch.where(all_alike, ends, inner), error
+
+
+def wanted_arc(answers: float, slack: float) -> float:
+    """Returns the arc length of the lowest p where groups are mixed nearly as often as at 1/2."""
+    p = torch.linspace(0, 0.5, 1001, dtype=torch.float64)
+    often = mixed(p, answers)
+    enough = often >= (1 - slack) * often[-1] - 1e-12
+    return float(p[enough][0].sqrt().asin())

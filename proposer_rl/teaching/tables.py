@@ -1,0 +1,152 @@
+"""What is known of items and levels, as tables of numbers: categories, ranks, and few columns."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from proposer_rl.settings import ArgumentError, shown
+
+MOST_TEXTS = 256  # that differ in a column, which is a category
+WIDEST = 24  # columns of inputs
+OUTLIER = 3.0  # standard deviations, beyond which a number of many counts as that
+ANSWERS = 16.0  # that a pass rate is taken for the mean of
+
+
+class Table(NamedTuple):
+    """What is known of N items.
+
+    Attributes:
+        numbers: float or int64 [N, D]; of a column of texts a column for each of them, 0 or 1.
+        categories: numbers of the texts of each item, counted from 0, int64 [N]; None without any.
+    """
+
+    numbers: Tensor
+    categories: Tensor | None
+
+
+def number_table(features: Any) -> Tensor:
+    """Returns numbers [N, D], whatever they are given as.
+
+    Raises:
+        ArgumentError: if they are no numbers.
+    """
+    array = hasattr(features, "__array__") and not isinstance(features, Tensor)
+    try:
+        table = torch.as_tensor(np.array(features) if array else features)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ArgumentError(f"features={shown(features)}: must be numbers [N, D]") from error
+    return table if table.is_floating_point() else table.long()  # small integers would overflow
+
+
+def item_table(features: Any) -> Table:
+    """Returns what a table, columns by name, or rows say of items.
+
+    A column whose first entry is a text is a category.
+
+    Raises:
+        ArgumentError: naming the column that has neither numbers nor few texts.
+    """
+    columns = _columns(features)
+    texts = [_begins_with_text(column) for column in columns.values()]
+    if not columns or not any(texts) and hasattr(features, "__array__"):
+        return Table(number_table(features), None)
+    if len({len(column) for column in columns.values()}) > 1:
+        raise ArgumentError(f"features={[*columns]}: must have columns of one length")
+    parts, codes = [], []
+    for (name, column), is_text in zip(columns.items(), texts, strict=True):
+        if not is_text:
+            parts.append(_numbers(f"features.{name}", column))
+            continue
+        found, code = np.unique([*map(str, column)], return_inverse=True)
+        if len(found) > MOST_TEXTS:
+            raise ArgumentError(
+                f"features.{name}: has {len(found):,} texts that differ; a category may have "
+                f"{MOST_TEXTS}; say in numbers what other texts are like"
+            )
+        codes.append(torch.from_numpy(code.reshape(-1)))
+        parts.append(torch.nn.functional.one_hot(codes[-1], len(found)).double())
+    categories = torch.stack(codes, 1).unique(dim=0, return_inverse=True)[1] if codes else None
+    return Table(torch.cat(parts, 1), categories)
+
+
+def _columns(features: Any) -> dict[str, Any]:
+    """Returns columns by name, of rows with texts by place; nothing where all are numbers."""
+    if hasattr(features, "items"):
+        return {str(name): column for name, column in features.items()}
+    if isinstance(features, Tensor) or not _begins_with_text(features):
+        return {}
+    try:
+        rows = [[row] if isinstance(row, str) else [*row] for row in features]
+        return {str(place): column for place, column in enumerate(zip(*rows, strict=True))}
+    except (TypeError, ValueError) as error:
+        raise ArgumentError("features: must have rows of one length") from error
+
+
+def _begins_with_text(cells: Any) -> bool:
+    """Returns whether the first of some cells, or one in the first row, is a text."""
+    first = next(iter(cells), None) if hasattr(cells, "__iter__") else None
+    inner = first if isinstance(first, list | tuple | np.ndarray) else [first]
+    return any(isinstance(cell, str) for cell in inner)
+
+
+def _numbers(name: str, column: Any) -> Tensor:
+    cells = column if hasattr(column, "__array__") else [*column]
+    try:
+        return torch.from_numpy(np.array(cells, dtype=np.float64)).reshape(len(cells), -1)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ArgumentError(f"{name}={shown(column)}: must be numbers or texts") from error
+
+
+def ranks(table: Tensor) -> Tensor:
+    """Returns the ranks of numbers [N, D] in their columns, from -1 to 1 with mean 0, float32.
+
+    Equal numbers share the middle of their ranks, so that neither an outlier nor a scale matters,
+    and a column of two values has two.
+
+    Example:
+        >>> ranks(torch.tensor([[1.0], [1e9], [1.0], [3.0]])).flatten()
+        tensor([-0.5000,  0.7500, -0.5000,  0.2500])
+    """
+    columns = table.double().mT.contiguous()
+    rising, order = columns.sort()
+    both = sum(torch.searchsorted(rising, rising, right=right) for right in (False, True))
+    middle = (both / len(table) - 1).float()
+    return torch.empty_like(middle).scatter_(1, order, middle).mT.contiguous()
+
+
+def few_columns(table: Tensor) -> Tensor:
+    """Returns ranks [N, D], of wide tables those of their first principal components.
+
+    Args:
+        table: finite numbers [N, D].
+
+    Returns:
+        float32 [N, min(D, WIDEST)].
+    """
+    if table.shape[1] <= WIDEST:
+        return ranks(table)
+    own = table.float() - table.float().mean(0)
+    own = (own / own.std(0).clamp_min(1e-12)).clamp(-OUTLIER, OUTLIER)
+    vectors = torch.linalg.eigh((own.mT @ own).double()).eigenvectors[:, -WIDEST:].flip(1)
+    return ranks(own @ vectors.float())
+
+
+def rate_columns(rates: Tensor) -> Tensor:
+    """Returns what pass rates [N] say, NaN where there is none: float32 [N, 1], or 2 with these."""
+    missing = rates.isnan()
+    known = torch.zeros(len(rates), 1)
+    known[~missing] = ranks(rates[~missing].unsqueeze(1))
+    return torch.cat([known, ranks(missing.double()[:, None])], 1) if missing.any() else known
+
+
+def expected_log_odds(rates: Tensor) -> Tensor:
+    """Returns the log odds of pass rates, each the mean of some answers: float64 [N].
+
+    Where a rate is missing, NaN, they are the mean of the others.
+    """
+    odds = ((rates.double() * ANSWERS + 0.5) / (ANSWERS + 1)).logit()
+    return odds.where(~odds.isnan(), odds.nanmean().nan_to_num(0.0))
