@@ -10,7 +10,7 @@ import argparse
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,23 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import proposer_rl as prl
-from proposer_rl.cli.errors import ConfigError, command, number, say
+from proposer_rl.cli.errors import ConfigError, command, say
 from proposer_rl.curricula.belief import Belief
 from proposer_rl.runs.folder import write_atomically
-from research.tiny_lm import ANSWERED, FAMILIES, LEVELS, Adam, Stack, encoded, graded, problem, to_end
+from research.prompt_tables import results_in, write
+from research.tiny_lm import (
+    ANSWERED,
+    CELLS,
+    FAMILIES,
+    LEVELS,
+    Adam,
+    Stack,
+    encoded,
+    graded,
+    problem,
+    to_end,
+)
 
-CELLS = [(family, level) for family in FAMILIES for level in range(1, LEVELS + 1)]
 TRAPPED = "shift"  # the family whose answers are graded wrong for a while
 DECAYS = 0.5, 0.8, 0.95, 1.0  # of Beta posteriors at each visit; the first is MoPPS's
 
@@ -38,7 +49,9 @@ class Arm:
     Attributes:
         method: the name of a curriculum.
         settings: that differ from its defaults.
-        features: whether it is told families and levels.
+        features: what it is told of families and levels: ``numbers``, families as categories and
+            levels as numbers; ``texts``, a category for each level of each family; ``rates``, a
+            guess of the pass rate by the level alone, for there is no other model; or nothing.
         target: the family that is to be mastered; None for all.
         refill: dynamic sampling (Yu et al. 2025): prompts are drawn until there are as many mixed
             groups as prompts of a round, and no others are trained on; what is over is lost.
@@ -47,26 +60,32 @@ class Arm:
 
     method: str
     settings: Mapping[str, Any] = field(default_factory=dict)
-    features: bool = True
+    features: str = "numbers"
     target: str | None = None
     refill: bool = False
     trap: bool = False
 
 
-ARMS = {
-    "uniform": Arm("domain_randomization"),
-    "dynamic sampling": Arm("domain_randomization", refill=True),
+UNIFORM, DYNAMIC, OURS = "uniform", "dynamic sampling", "adaptive_mixture"
+METHODS = {
+    UNIFORM: Arm("domain_randomization"),
+    DYNAMIC: Arm("domain_randomization", refill=True),
+    "mopps": Arm("mopps"),
+    "adarft": Arm("adarft", features="rates"),
+    "sec": Arm("sec", features="texts"),
+    "arc_length": Arm("arc_length"),
     "plr": Arm("plr", {"score": "learnability", "temperature": 0.3}),
-    "adaptive_mixture": Arm("adaptive_mixture"),
-    "adaptive_mixture, no features": Arm("adaptive_mixture", features=False),
-    "adaptive_mixture, target add": Arm("adaptive_mixture", target="add"),
+    OURS: Arm(OURS),
+    f"{OURS}, no features": Arm(OURS, features=""),
+    f"{OURS}, target add": Arm(OURS, target="add"),
 }
-ARMS |= {
-    f"{name}, trap": Arm(arm.method, arm.settings, arm.features, arm.target, arm.refill, True)
-    for name, arm in ARMS.items()
-    if name in ("uniform", "dynamic sampling", "plr", "adaptive_mixture")
+TRAP = ", trap"
+ARMS = METHODS | {
+    f"{name}{TRAP}": replace(METHODS[name], trap=True)
+    for name in (UNIFORM, DYNAMIC, "mopps", "sec", "arc_length", OURS)
 }
-LOOKED = "uniform", "adaptive_mixture"  # arms whose prompts the predictors see
+NAMES = {"uniform": UNIFORM, "dynamic": DYNAMIC, "ours": OURS, "trap": TRAP, "trapped": TRAPPED}
+LOOKED = UNIFORM, OURS  # arms whose prompts the predictors see
 
 
 @dataclass(frozen=True)
@@ -122,12 +141,18 @@ class Prompts:
         self.asked, self.right = (torch.stack(one) for one in zip(*trained, strict=True))
         self.kept_asked, self.kept_right = (torch.stack(one) for one in zip(*kept, strict=True))
         self.cell = torch.arange(len(CELLS)).repeat_interleave(setting.prompts)
-        levels = torch.tensor([level for _, level in CELLS]).float()[self.cell]
-        family = torch.arange(len(FAMILIES)).repeat_interleave(LEVELS * setting.prompts)
-        self.features = torch.cat(
-            [torch.nn.functional.one_hot(family).float(), levels.unsqueeze(1)], 1
-        )
-        self.family = family
+        of = [CELLS[cell] for cell in self.cell.tolist()]
+        families, levels = (list(one) for one in zip(*of, strict=True))
+        rates = [1 - level / (LEVELS + 1) for level in levels]
+        self.known: dict[str, dict[str, Any]] = {
+            "numbers": {"features": {"family": families, "level": levels}},
+            "texts": {"features": {"level": [f"{family} {level}" for family, level in of]}},
+            "rates": {"pass_rates": rates},
+            "": {},
+        }
+        self.of_family = {
+            family: torch.tensor([one == family for one in families]) for family in FAMILIES
+        }
 
 
 def warmed(seeds: Sequence[int], setting: Setting, data: Prompts, device: str) -> Stack:
@@ -181,8 +206,9 @@ class Predictors:
 
     def __init__(self, data: Prompts, group: int) -> None:
         self._data, self._group = data, group
-        count, known = len(data.cell), prl.Items(len(data.cell), features=data.features)
-        self._inputs = known.coordinates.double()
+        count = len(data.cell)
+        items = prl.Items(count, **data.known["numbers"])
+        self._inputs = items.inputs(items.generate(torch.arange(count), [])).double()
         self._beliefs = {
             "belief": Belief(self._inputs.shape[1], count),
             "belief, no features": Belief(0, count),
@@ -221,10 +247,8 @@ def teach(
 ) -> list[dict[str, Any]]:
     """Trains warmed models [S] by GRPO on an arm's prompts, and returns what came of each."""
     arm, students = ARMS[name], len(seeds)
-    known = data.features if arm.features else None
-    target = None if arm.target is None else (data.family == FAMILIES.index(arm.target)).nonzero()
-    places = None if target is None else target.flatten().tolist()
-    space = partial(prl.Items, len(data.cell), features=known, target=places)
+    places = None if arm.target is None else data.of_family[arm.target].nonzero().flatten().tolist()
+    space = partial(prl.Items, len(data.cell), **data.known[arm.features], target=places)
     recipe = getattr(prl.curricula, arm.method)(**arm.settings)
     teachers = [prl.Teacher(recipe, space(), seed=seed) for seed in seeds]
     looked = [] if name not in LOOKED else seeds
@@ -240,11 +264,11 @@ def teach(
     began, taught = time.process_time(), 0.0
     shape = setting.batch, setting.group, ANSWERED
 
-    for number_ in range(setting.rounds + 1):
-        if number_ % setting.every == 0:
+    for at in range(setting.rounds + 1):
+        if at % setting.every == 0:
             rates = stack.pass_rates(*kept).view(students, len(CELLS), -1).mean(-1)
             passed.append(rates.cpu())
-        if number_ == setting.rounds:
+        if at == setting.rounds:
             break
         start = time.process_time()
         items = torch.stack([torch.as_tensor(one.propose(setting.batch)) for one in teachers])
@@ -253,9 +277,8 @@ def teach(
         draws = torch.stack([torch.rand(*shape, generator=one) for one in generators])
         said = stack.answer(asked[row, chosen], setting.group, draws.to(device))
         won = graded(said, right[row, chosen].unsqueeze(2))
-        if arm.trap and 3 * number_ < setting.rounds:
-            fault = (data.family == FAMILIES.index(TRAPPED)).to(device)
-            won &= ~fault[chosen].unsqueeze(2)
+        if arm.trap and 3 * at < setting.rounds:
+            won &= ~data.of_family[TRAPPED].to(device)[chosen].unsqueeze(2)
         shares = won.float().mean(2).cpu()
         start = time.process_time()
         for one, share in zip(teachers, shares, strict=True):
@@ -273,7 +296,9 @@ def teach(
         for pool, *of in zip(pools, chosen, said, won, mixed.to(device), strict=True):
             own, answers, marks, which = of
             pool += zip(own[which], answers[which], marks[which].float(), strict=True)
-            some.append(pool[: setting.batch] if not arm.refill or len(pool) >= setting.batch else [])
+            some.append(
+                pool[: setting.batch] if not arm.refill or len(pool) >= setting.batch else []
+            )
             if some[-1] or not arm.refill:
                 pool.clear()
         step(stack, adam, asked, some, setting)
@@ -404,11 +429,13 @@ def _run(options: argparse.Namespace) -> None:
     changed = {name: value for name, value in json.loads(options.set).items()}
     setting = Setting(**changed)
     study(options.folder, options.arms or [*ARMS], options.seeds, setting, options.device)
+    print(write(options.output or options.folder, results_in(options.folder, [*ARMS]), **NAMES))
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="bin/research prompts", description=__doc__)
     parser.add_argument("--folder", type=Path, default=Path("runs/prompts"), help="of the runs")
+    parser.add_argument("-o", "--output", type=Path, help="a folder for the page (that of runs)")
     parser.add_argument("--arms", nargs="+", choices=[*ARMS], help="some of them (all)")
     parser.add_argument("--seeds", type=_seeds, default=_seeds("100-109"), help="(100-109)")
     parser.add_argument("--device", default="cpu", help="cpu or cuda (cpu)")

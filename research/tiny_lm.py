@@ -25,6 +25,7 @@ CODES = {sign: code for code, sign in enumerate(SIGNS)}
 ASKED, ANSWERED = 10, 7  # signs of a prompt and of an answer at most
 FAMILIES = ("add", "reverse", "sort", "shift")
 LEVELS = 4
+CELLS = [(family, level) for family in FAMILIES for level in range(1, LEVELS + 1)]
 
 BETAS = 0.9, 0.99  # of Adam
 
@@ -131,7 +132,9 @@ class Stack:
             made = (_normed(x) @ own[f"attend{layer}"]).view(students * count, length, 3, heads, -1)
             query, key, value = made.permute(2, 0, 3, 1, 4)
             if past:
-                key, value = (torch.cat(two, 2) for two in zip(past[layer], (key, value), strict=True))
+                key, value = (
+                    torch.cat(two, 2) for two in zip(past[layer], (key, value), strict=True)
+                )
             present.append((key, value))
             seen = F.scaled_dot_product_attention(query, key, value, allowed)
             seen = seen.transpose(1, 2).reshape(students, count * length, width)
@@ -189,7 +192,10 @@ class Stack:
         """Reads prompts once for the G answers to each; their last logits, cache and padding."""
         padded = prompts == PAD
         read, cache = self.forward(prompts, padded=padded)
-        cache = [(key.repeat_interleave(group, 0), value.repeat_interleave(group, 0)) for key, value in cache]
+        cache = [
+            (key.repeat_interleave(group, 0), value.repeat_interleave(group, 0))
+            for key, value in cache
+        ]
         again = (one.repeat_interleave(group, 1) for one in (read[:, :, -1:], padded))
         last, padded = again
         return last, cache, padded
