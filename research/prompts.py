@@ -10,7 +10,7 @@ import argparse
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -415,6 +415,16 @@ def _read(folder: Path, arm: str, seed: int) -> dict[str, Any]:
     return found
 
 
+def read_setting(text: str) -> Setting:
+    """Returns a setting from JSON of what differs."""
+    try:
+        given = json.loads(text)
+        return Setting(**given)
+    except (ValueError, TypeError) as error:
+        names = ", ".join(one.name for one in fields(Setting))
+        raise ConfigError(f"--set {text}: must be a JSON object of some of {names}") from error
+
+
 def _seeds(text: str) -> list[int]:
     first, _, last = text.partition("-")
     return [*range(int(first), int(last or first) + 1)]
@@ -426,8 +436,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
-    changed = {name: value for name, value in json.loads(options.set).items()}
-    setting = Setting(**changed)
+    setting = read_setting(options.set)
     study(options.folder, options.arms or [*ARMS], options.seeds, setting, options.device)
     print(write(options.output or options.folder, results_in(options.folder, [*ARMS]), **NAMES))
 

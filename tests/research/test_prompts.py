@@ -110,7 +110,7 @@ def test_a_step_of_a_stack_is_that_of_plain_models_one_by_one() -> None:
             for answer, mark in zip(answers, marks, strict=True):
                 prompt = [one for one in made[0][item].tolist() if one]
                 end = answer.tolist().index(END) + 1 if END in answer else ANSWERED
-                text = [-1] * 0 + prompt + answer.tolist()[:end]
+                text = prompt + answer.tolist()[:end]
                 signs = torch.tensor(text)
                 found = plain(alone, [*prompt, -1, *text[len(prompt) :]], SIZES.heads)
                 after = torch.arange(len(prompt), len(text))
@@ -165,24 +165,29 @@ def test_a_study_goes_on_where_it_was_and_refuses_another_setting(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     changed = '{"prompts":3,"held_out":2,"batch":4,"group":3,"rounds":4,"every":2,"warm":2}'
-    arms = [prompts.UNIFORM, prompts.DYNAMIC, prompts.OURS, f"{prompts.OURS}{prompts.TRAP}"]
-    arms.append(f"{prompts.UNIFORM}{prompts.TRAP}")
+    arms = [prompts.UNIFORM, prompts.DYNAMIC, prompts.OURS, f"{prompts.UNIFORM}{prompts.TRAP}"]
     given = ["--folder", str(tmp_path), "--seeds", "0-1", "--set", changed, "--arms", *arms]
     prompts.main(given)
-    written = (tmp_path / "README.md").read_text()
+    page = (tmp_path / "README.md").read_text()
+    assert all(arm in page.replace("\\", "") for arm in arms)
     first = prompts.results_in(tmp_path, arms)
     (tmp_path / "uniform_1.json").unlink()
-    prompts.main(given)
+    setting = prompts.read_setting(changed)
+    prompts.study(tmp_path, arms, [0, 1], setting, "cpu")
     again = prompts.results_in(tmp_path, arms)
     assert [one["arm"] for one in again] == [one for one in arms for _ in range(2)]
     for one, other in zip(first, again, strict=True):
-        assert one["drawn"] == other["drawn"] and sum(one["drawn"]) == 4 * TINY.batch
+        assert one["drawn"] == other["drawn"] and sum(one["drawn"]) == 4 * 4
         np.testing.assert_allclose(one["passed"], other["passed"], atol=2e-4)
-    assert all(arm in written.replace("\\", "") for arm in arms)
     capsys.readouterr()
-    with pytest.raises(SystemExit) as end:
-        prompts.main([*given[:5], '{"rounds": 5}'])
-    assert end.value.code == 2 and "another setting: prompts" in capsys.readouterr().err
+    for text, said in (
+        ('{"rounds": 5}', "another setting: prompts"),
+        ('{"round": 5}', "round"),
+        ("5", "must be a JSON object"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            prompts.main([*given[:5], text])
+        assert end.value.code == 2 and said in capsys.readouterr().err
 
 
 def test_the_page_follows_from_its_tables() -> None:
