@@ -21,7 +21,6 @@ from proposer_rl.runs.folder import write_atomically
 from research.publish import MARK
 from research.tiny_lm import CELLS, FAMILIES, LEVELS
 
-Runs = pd.DataFrame
 Array = NDArray[np.float64]
 EASY = 2  # levels of each family, whose losses count as forgetting
 BUDGET = 0.8  # of dynamic sampling's rollouts: ours may have 1.25 times as many
@@ -31,7 +30,7 @@ CURVES = "passed.csv.xz"
 FACTS = "runs.csv"
 
 
-def tables_of(results: Sequence[Mapping[str, Any]]) -> tuple[Runs, Runs]:
+def tables_of(results: Sequence[Mapping[str, Any]]) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Returns runs as two tables: a row for each, and one for each evaluation of each."""
     facts, curves = [], []
     for run in results:
@@ -52,14 +51,14 @@ def cells() -> list[str]:
 
 
 class Study:
-    """Runs of some arms with the same seeds.
+    """pd.DataFrame of some arms with the same seeds.
 
     Attributes:
         curves: pass rates of each arm, float [S, E, families, levels].
         rollouts: at each of E evaluations, [E].
     """
 
-    def __init__(self, facts: Runs, curves: Runs) -> None:
+    def __init__(self, facts: pd.DataFrame, curves: pd.DataFrame) -> None:
         self.facts = {name: own.sort_values("seed") for name, own in facts.groupby("arm")}
         self.rollouts = np.sort(curves["rollouts"].unique()).astype(float)
         self.curves: dict[str, Array] = {}

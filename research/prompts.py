@@ -166,7 +166,7 @@ def warmed(seeds: Sequence[int], setting: Setting, data: Prompts, device: str) -
         batches = []
         for generator, kept in zip(generators, data.kept_texts, strict=True):
             cells = generator.choice(len(CELLS), setting.examples, p=shares)
-            made = [problem(*CELLS[cell], generator) for cell in cells]
+            made = [problem(*CELLS[int(cell)], generator) for cell in cells]
             batches.append(encoded([one if one[0] not in kept else made[0] for one in made]))
         asked, right = (torch.stack(one).to(device) for one in zip(*batches, strict=True))
         found = stack.log_probabilities(asked, right.unsqueeze(2)).squeeze(2)
@@ -285,8 +285,8 @@ def teach(
             count = torch.full_like(share, setting.group)
             one.observe({"return": share, "success": share, "episodes": count})
         taught += time.process_time() - start
-        for one, own, share in zip(predictors, items, shares, strict=False):
-            one.look(own, share)
+        for predictor, own, share in zip(predictors, items, shares, strict=False):
+            predictor.look(own, share)
         mixed = (shares > 0) & (shares < 1)
         flat += 1 - mixed.float().mean(1)
         drawn += torch.stack(
