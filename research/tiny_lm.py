@@ -106,7 +106,9 @@ class Stack:
             for name, (*shape, deviation) in shapes.items()
         }
 
-    def forward(self, tokens: Tensor, past: Cache | None = None, padded: Tensor | None = None):
+    def forward(
+        self, tokens: Tensor, past: Cache | None = None, padded: Tensor | None = None
+    ) -> tuple[Tensor, Cache]:
         """Returns log probabilities of the next sign after each, and what later ones attend to.
 
         Args:
@@ -196,13 +198,14 @@ class Stack:
             (key.repeat_interleave(group, 0), value.repeat_interleave(group, 0))
             for key, value in cache
         ]
-        again = (one.repeat_interleave(group, 1) for one in (read[:, :, -1:], padded))
-        last, padded = again
+        last, padded = (one.repeat_interleave(group, 1) for one in (read[:, :, -1:], padded))
         return last, cache, padded
 
 
 class Adam:
     """Adam (Kingma and Ba 2015) of a stack, of which some may stay as they are in a step.
+
+    Gradients are clipped to a norm of 1, each model's by itself.
 
     Args:
         stack: whose gradients it takes.
@@ -224,8 +227,8 @@ class Adam:
     def _move(self, slopes: Sequence[Tensor], moving: Tensor) -> None:
         goes = moving.view(-1, 1, 1).float()
         self._steps += goes
-        sizes = sum(slope.square().sum((1, 2), keepdim=True) for slope in slopes)
-        short = (1 / (sizes.sqrt() + 1e-12)).clamp(max=1)
+        squares = torch.stack([slope.square().sum((1, 2), keepdim=True) for slope in slopes])
+        short = (1 / (squares.sum(0).sqrt() + 1e-6)).clamp(max=1)
         first, second = BETAS
         steps = self._steps.clamp(min=1)
         for (name, one), slope in zip(self._of.items(), slopes, strict=True):
