@@ -149,7 +149,7 @@ def commands(extra: str, methods: list[str]) -> Iterator[list[str]]:
         methods: all that there are.
     """
     if extra == "":
-        others = {"alp_gmm", "frozen_proposer"}
+        others = {"alp_gmm", "frozen_proposer", "adarft", "sec"}  # the last two: of items alone
         for method in methods:
             if method not in others:
                 yield _trained(method, f"+method={method}", *FEW)

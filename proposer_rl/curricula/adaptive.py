@@ -61,7 +61,7 @@ SOON, LATER = 6.0, 20.0  # half-lives in batches: of sums, and of b where succes
 FEW = 16  # levels, of which fewer are counted as a part of a batch
 RARE = 0.02  # share of successes, below which the belief learns from returns, too
 LEARNABLE = 0.2  # of the bonus, in squared distances per input
-ITEMS_LEARNABLE, ITEMS_TIMES = 1.0, 4  # that, and times as many candidates, where levels come back
+ITEMS_LEARNABLE, ITEMS_TIMES = 1.0, 4  # that, and times as many candidates, of a data set
 NEAR = 0.025  # standard deviation of what is added between two levels, in shares of a range
 AT_ONCE = 64  # levels of the way that are assigned to draws of the target together
 FORBIDDEN = 1e3  # cost of a candidate that is not mastered
@@ -104,6 +104,8 @@ class AdaptiveMixture(Curriculum):
         times: Count = 4,
     ) -> None:
         self._space, self._target = space, target
+        # A data set has items, and nothing between two of them.
+        self._is_data = hasattr(space, "items") and not hasattr(space, "between")
         self._known = inputs or partial(level_inputs, space)
         self._delta, self._half_life, self._times = delta, half_life, times
         self._inbox = Inbox()
@@ -283,14 +285,15 @@ class AdaptiveMixture(Curriculum):
         """Returns levels [n] that are mastered, and near to the target."""
         goal = self._space if self._target is None else self._target
         targets = goal.sample(count, draw)
-        times = self._times * (ITEMS_TIMES if hasattr(self._space, "items") else 1)
+        times = self._times * (ITEMS_TIMES if self._is_data else 1)
         levels = self._candidates(k, times * count, targets, draw)
         goals, x, items = self._inputs(targets), self._inputs(levels), self._items(levels)
         belief = self._beliefs[k]
-        # What comes back is explored by draws, which differ where little or nothing new is known.
-        p = belief.predict(x) if items is None else belief.draw(x, items, draw)
+        # Items are explored by draws, which differ where little is known, or nothing new.
+        explores = self._is_data and items is not None
+        p = belief.draw(x, items, draw) if explores else belief.predict(x, items)
         allowed = p >= p.topk(count).values[-1].clamp(max=self._delta)
-        bonus = LEARNABLE if items is None else ITEMS_LEARNABLE
+        bonus = ITEMS_LEARNABLE if self._is_data else LEARNABLE
         extra = torch.where(allowed, -bonus * 4 * p * (1 - p), FORBIDDEN)
         chosen = []
         for start in range(0, count, AT_ONCE):
@@ -304,7 +307,7 @@ class AdaptiveMixture(Curriculum):
     def _candidates(self, k: int, count: int, targets: Levels, draw: torch.Generator) -> Levels:
         """Returns levels [n] of the space and, if it can tell, between the last way and targets."""
         space: Any = self._space
-        if hasattr(space, "items"):  # none twice, where there are enough
+        if self._is_data:  # none twice, where there are enough
             order = torch.randperm(space.size, generator=draw)
             places = order.repeat(-(-count // space.size))[:count]
             made: Levels = space.generate(places[None], [draw])[0]

@@ -128,8 +128,9 @@ class Belief:
             items, row = items.unique(return_inverse=True)
             none = torch.zeros(len(items), dtype=torch.float64)
             won, counts = (none.index_add(0, row, one) for one in (counts * labels, counts))
-            labels, inputs = won / counts, inputs.new_empty(len(items), inputs.shape[1]).index_copy(
-                0, row, inputs
+            labels, inputs = (
+                won / counts,
+                inputs.new_empty(len(items), inputs.shape[1]).index_copy(0, row, inputs),
             )
             own, doubt = self._own[items], self._doubt[items]
         phi, prior, precision = self._columns(inputs), self._mean, self._precision

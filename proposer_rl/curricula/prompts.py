@@ -23,6 +23,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.outcome_model import calibration
+from proposer_rl.curricula.scores import mixed
 from proposer_rl.curricula.student import Student
 from proposer_rl.meta.actions import systematic_draw
 from proposer_rl.settings import ArgumentError, Decay, Positive, Share, checked
@@ -132,18 +133,18 @@ class BetaSampling(ItemCurriculum):
 
         a <- decay a + (1 - decay) + m,    b <- decay b + (1 - decay) + G - m,
 
-    both 1 at first; those are drawn whose draws from Beta(a, b) are the nearest to ``target``.
+    both 1 at first; those are drawn whose draws from Beta(a, b) are the nearest to ``aim``.
 
     Args:
         space: see :class:`ItemCurriculum`.
         decay: part of what was known that is kept at each observation.
-        target: success that is looked for.
+        aim: success that is looked for.
     """
 
     @checked
-    def __init__(self, space: Space, *, decay: Share = 0.5, target: Share = 0.5) -> None:
+    def __init__(self, space: Space, *, decay: Share = 0.5, aim: Share = 0.5) -> None:
         super().__init__(space)
-        self._decay, self._target = decay, target
+        self._decay, self._aim = decay, aim
 
     def first_numbers(self, students: int) -> dict[str, Tensor]:
         """Returns a and b, float64 [K, N]."""
@@ -151,9 +152,9 @@ class BetaSampling(ItemCurriculum):
         return {"a": one, "b": one.clone()}
 
     def draw(self, own: dict[str, Tensor], count: int, generator: torch.Generator) -> Tensor:
-        """Draws the items nearest to the target."""
+        """Draws the items nearest to the aim."""
         a, b = (torch._standard_gamma(own[name], generator=generator) for name in ("a", "b"))
-        return nearest(a / (a + b) - self._target, count, generator)
+        return nearest(a / (a + b) - self._aim, count, generator)
 
     def learn(self, own: dict[str, Tensor], seen: dict[str, Tensor]) -> None:
         """Moves the Beta distributions of the items that were seen."""
@@ -172,7 +173,7 @@ class AdaptiveDifficulty(ItemCurriculum):
     Shi et al. 2025 (arXiv 2504.05520), with difficulties from 0 to 1, 1 less a pass rate: with r
     the mean success of a batch,
 
-        T <- T + step tanh(sensitivity (r - target)),    within the difficulties there are,
+        T <- T + step tanh(sensitivity (r - aim)),    within the difficulties there are,
 
     which begins with the lowest.
 
@@ -180,7 +181,7 @@ class AdaptiveDifficulty(ItemCurriculum):
         space: of items with a pass rate each.
         step: of T at most.
         sensitivity: of T to the reward.
-        target: success that is looked for.
+        aim: success that is looked for.
 
     Raises:
         ArgumentError: if items have no pass rates.
@@ -193,7 +194,7 @@ class AdaptiveDifficulty(ItemCurriculum):
         *,
         step: Positive = 0.5,
         sensitivity: Positive = 2.0,
-        target: Share = 0.5,
+        aim: Share = 0.5,
     ) -> None:
         super().__init__(space)
         rates: Tensor | None = getattr(space, "pass_rates", None)
@@ -201,7 +202,7 @@ class AdaptiveDifficulty(ItemCurriculum):
             found = "none" if rates is None else f"{int(rates.isnan().sum())} missing"
             raise ArgumentError(f"pass_rates: {found}: this curriculum needs one of each item")
         self._difficulty = 1 - rates
-        self._step, self._sensitivity, self._target = step, sensitivity, target
+        self._step, self._sensitivity, self._aim = step, sensitivity, aim
 
     def first_numbers(self, students: int) -> dict[str, Tensor]:
         """Returns the difficulty T, float64 [K, 1]."""
@@ -214,7 +215,7 @@ class AdaptiveDifficulty(ItemCurriculum):
     def learn(self, own: dict[str, Tensor], seen: dict[str, Tensor]) -> None:
         """Moves T."""
         reward = (seen["success"] * seen["count"]).sum() / seen["count"].sum()
-        moved = self._step * (self._sensitivity * (reward - self._target)).tanh()
+        moved = self._step * (self._sensitivity * (reward - self._aim)).tanh()
         low, high = self._difficulty.min(), self._difficulty.max()
         own["difficulty"].add_(moved).clamp_(low, high)
 
@@ -244,9 +245,7 @@ class CategoryBandit(ItemCurriculum):
     """
 
     @checked
-    def __init__(
-        self, space: Space, *, rate: Share = 0.5, temperature: Positive = 0.4
-    ) -> None:
+    def __init__(self, space: Space, *, rate: Share = 0.5, temperature: Positive = 0.4) -> None:
         super().__init__(space)
         categories: Tensor | None = getattr(space, "categories", None)
         if categories is None:
@@ -391,20 +390,6 @@ def nearest(
     places = mixed_up[keys.argsort(stable=True)[:rest]]
     places = torch.cat([*([mixed_up] * rounds), places])
     return places[torch.randperm(count, generator=generator)]
-
-
-def mixed(p: Tensor, answers: Tensor | float) -> Tensor:
-    """Returns the probability that not all answers to an item are alike.
-
-    Args:
-        p: probability of a right one.
-        answers: number G of them.
-
-    Example:
-        >>> mixed(torch.tensor([0.0, 0.5, 0.9]), 2.0)
-        tensor([0.0000, 0.5000, 0.1800])
-    """
-    return 1 - p**answers - (1 - p) ** answers
 
 
 def arc_length(right: Tensor, answers: Tensor) -> tuple[Tensor, Tensor]:

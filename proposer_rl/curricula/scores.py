@@ -68,7 +68,7 @@ where nothing can be said.
 """
 
 ASKS = {"gradient_norm": ("policy_gradient_norms",)}  # of a student, from episodes
-READS = {"learnability": ("success",), "gradient_norm": ("rollout",)}
+READS = {"learnability": ("success",), "yield": ("success",), "gradient_norm": ("rollout",)}
 AT_ONCE = 1024  # levels of each Solver that are evaluated at once
 
 STEPWISE: dict[str, Callable[[Student, TensorDictBase, Tensor], Tensor]] = {
@@ -272,7 +272,7 @@ class Scorer:
             score = best - mean
         else:
             share = successes.sum(0) / some
-            score = share * (1 - share)
+            score = mixed(share, some) if self._name == "yield" else share * (1 - share)
         score = score.double().where(count > 0, -torch.inf)
         return Scored(score.cpu(), best.float().cpu())
 
@@ -326,6 +326,7 @@ class Scorer:
             return self.of_rollouts(student, played, none)
         told: Any = torch.stack([*played]).cpu()  # [rollouts, K, P]
         mean = {name: e.mean(0) for name, e in told.items() if e.is_floating_point()}
+        mean["episodes"] = told.get("episodes", torch.ones(told.shape)).sum(0)
         outcome, best = TensorDict(mean, told.shape[1:]), told["return"].amax(0)
         return self.of_outcome(student, outcome, best, before)
 
@@ -337,6 +338,20 @@ class Scorer:
             raise ValueError(f"score={self._name}: must return a tensor {list(shape)} without NaN")
         ended = outcome.get("episodes", torch.ones(shape)).cpu() > 0
         return score.double().cpu().where(ended, -torch.inf)
+
+
+def mixed(p: Tensor, answers: Tensor | float) -> Tensor:
+    """Returns the probability that not all answers to an item are alike.
+
+    Args:
+        p: probability of a right one.
+        answers: number G of them.
+
+    Example:
+        >>> mixed(torch.tensor([0.0, 0.5, 0.9]), 2.0)
+        tensor([0.0000, 0.5000, 0.1800])
+    """
+    return 1 - p**answers - (1 - p) ** answers
 
 
 def _own_score(score: str | OwnScore) -> OwnScore | None:
@@ -367,5 +382,6 @@ def _of_returns(name: str, outcome: Mapping[str, Tensor], best: Tensor, before: 
         "max_mc": best - value,
         "regret": best - reached,
         "learnability": success * (1 - success),
+        "yield": mixed(success, outcome.get("episodes", torch.ones_like(success))),
     }[name]
     return Scored(score, best.float())

@@ -52,7 +52,7 @@ def item_table(features: Any) -> Table:
     """
     columns = _columns(features)
     texts = [_begins_with_text(column) for column in columns.values()]
-    if not columns or not any(texts) and hasattr(features, "__array__"):
+    if not columns or (not any(texts) and hasattr(features, "__array__")):
         return Table(number_table(features), None)
     if len({len(column) for column in columns.values()}) > 1:
         raise ArgumentError(f"features={[*columns]}: must have columns of one length")

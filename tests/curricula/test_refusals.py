@@ -10,7 +10,12 @@ from typing import Any
 import pytest
 import torch
 
+import proposer_rl as prl
 from proposer_rl.curricula import (
+    AdaptiveDifficulty,
+    ArcLengthFilter,
+    BetaSampling,
+    CategoryBandit,
     Curriculum,
     Filtered,
     FirstOrderCurriculum,
@@ -41,6 +46,7 @@ gaussians = partial(MixtureCurriculum, SPACE, refit=64, warmup=64)
 first_order = partial(FirstOrderCurriculum, SPACE, TARGET)
 proposer = partial(FirstOrderProposer, SPACE, TARGET, problem_agent(), SETTINGS)
 keep = partial(Filtered, TWO[0], GivenScores(torch.zeros(1, 1)))
+ONE_RATE = prl.Items(2, pass_rates=[0.5, float("nan")])
 no_edits = partial(ReplayCurriculum, SPACE, Scorer("positive_value_loss", "episodes"))
 
 REFUSED: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
@@ -101,6 +107,12 @@ REFUSED: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (partial(SomeBins, SPACE), {"values": {"walls": [1]}}, r"values.walls=\[1.0\]: must be among"),
     (partial(SomeBins, SPACE), {"values": {"path length": [3]}}, r"values.path length=\[3.0\]"),
     (partial(SomeBins, SPACE), {"values": {"path length": []}}, r"values.path length=\[\]: "),
+    (partial(AdaptiveDifficulty, SPACE), {}, "pass_rates: none: this curriculum needs one of each"),
+    (partial(AdaptiveDifficulty, ONE_RATE), {}, "pass_rates: 1 missing: this curriculum needs one"),
+    (partial(AdaptiveDifficulty, ONE_RATE), {"step": 0}, "step=0: input should be greater than 0"),
+    (partial(CategoryBandit, ONE_RATE), {}, "features: have no texts: this curriculum needs a cat"),
+    (partial(BetaSampling, SPACE), {"decay": 2}, "decay=2: input should be less than or equal to"),
+    (partial(ArcLengthFilter, SPACE), {"slack": 1}, "slack=1: input should be less than 1"),
     (keep, {"times": 1}, "times=1: input should be greater than or equal to 2"),
     (keep, {"temperature": 0.0}, "temperature=0.0: input should be greater than 0"),
     (partial(Mixed, TWO), {"shares": [1.0]}, r"shares=\[1.0\]: 2 curricula need as many"),

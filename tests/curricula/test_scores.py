@@ -73,6 +73,7 @@ def score(name: str, *rollouts: TensorDict, best: Tensor = NONE) -> float:
         ("positive_value_loss", played(FAILED, success=False, after=0.3), 0.02),
         ("max_mc", played(FAILED, success=False), -0.23),  # -0.20 if the maximum began at 0
         ("learnability", played(FIRST, SHORT), 0.0),
+        ("yield", played(FIRST, SHORT), 0.0),
         ("regret", played(FIRST, SHORT), 0.01),  # 0.99 - (0.97 + 0.99) / 2
     ],
 )

@@ -22,6 +22,7 @@ ROWS = {
     for name in re.findall(r"`(.+?)`", cells[0])
 }
 NUMBERS = prl.LevelGenerator(lambda n, g: torch.rand(n, generator=g))
+ITEMS = prl.Items(2, features=["add", "times"], pass_rates=[0.1, 0.9])
 RANGES = prl.Parameters({"gravity": (0.0, 1.0)}, target={"gravity": 1.0}, named={"easy": {}})
 
 
@@ -40,10 +41,10 @@ def test_the_table_is_that_of_the_code(row: str) -> None:
     given: Any = dict(re.findall(r'(\w+)="(\w+)"', settings))
     if name == "hand_designed":
         given = {"distributions": ["easy"], "until": []}
-    teacher = prl.Teacher(recipe(**given), RANGES, student=Able())
+    teacher = prl.Teacher(recipe(**given), ITEMS if "items" in space else RANGES, student=Able())
     assert list(teacher.reads) == told
     assert list(teacher.curriculum.needs) == functions
-    if {"bins", "target"} & {*space} or name == "accel":
+    if {"bins", "target", "items"} & {*space} or name == "accel":
         with pytest.raises((prl.ArgumentError, TypeError), match=r"bins|target|edits"):
             prl.Teacher(recipe(**given), NUMBERS, student=Able())
     elif "named" not in space:

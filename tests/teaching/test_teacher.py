@@ -135,6 +135,8 @@ FREE = {  # of what needs nothing of a learner, settings that are small
     "adr": {"episodes": 2},
     "spdl": {"episodes": 8},
     "adaptive_mixture": {},
+    "mopps": {},
+    "arc_length": {},
     "model_transport": {"probes": 1},
     "mixture": {"parts": {"currot": {"probes": 1}}},
 }
@@ -174,6 +176,7 @@ def test_whoever_needs_nothing_works_from_returns_and_success(name: str, space: 
         settings = {"distributions": ["id", "id"], "until": [2]}
     recipe = getattr(prl.curricula, name)(**settings)
     bins = {"alp_gmm", "adr", "spdl", "learning_progress", "model_transport", "mixture"}
+    bins |= {"mopps", "arc_length"}
     if space == "a generator" and name in bins:
         with pytest.raises(ArgumentError, match="draws from bins"):
             prl.Teacher(recipe, SPACES[space]())
