@@ -39,7 +39,11 @@ templates_path = ["_templates"]
 
 # bin/docs fails on warnings: nothing unlinked, nothing linked that is not there.
 nitpicky = True
-nitpick_ignore = [("py:class", "transformers.TrainerCallback")]  # a stand-in, see below
+nitpick_ignore = [  # stand-ins, see below
+    ("py:class", "transformers.TrainerCallback"),
+    ("py:class", "verl.experimental.dataset.sampler.AbstractCurriculumSampler"),
+    ("py:class", "TensorDictBase"),  # of tensordict, in a text alone
+]
 suppress_warnings = ["ref.python"]  # one name in two modules: an annotation is linked to either
 
 myst_enable_extensions = ["dollarmath"]
@@ -48,7 +52,7 @@ myst_heading_anchors = 3
 autosummary_ignore_module_all = True  # a name is documented where it is defined
 autodoc_default_options = {"members": True, "show-inheritance": True, "ignore-module-all": True}
 autodoc_member_order = "bysource"
-autodoc_mock_imports = ["transformers"]  # of the extra prompts, which docs do without
+autodoc_mock_imports = ["transformers", "verl"]  # which docs do without
 autodoc_typehints_format = "short"
 maximum_signature_line_length = 88
 napoleon_numpy_docstring = False

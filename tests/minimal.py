@@ -160,6 +160,7 @@ def commands(extra: str, methods: list[str]) -> Iterator[list[str]]:
         yield _trained("cartpole", "task=cartpole", "+method=first_order_sampled", *GYMNASIUM)
         few = ["task.levels=2", "solver.ppo.epochs=1", "pool.candidates=4"]
         yield _trained("gates", "task=point_mass", "+method=accel", *SMALL, *few)
+        yield _trained("robots", "task=robots", "+method=terrain_levels", *SMALL, *few[:2])
         yield ["watch", RUN, "--once"]
         yield ["report", f"{RUN}/perf_gain", "-o", "report"]
         yield from (["eval", f"{RUN}/{name}", "--levels", "small"] for name in ("target", "views"))
