@@ -263,9 +263,15 @@ def _predictions(study: Study, ours: str) -> str:
 
 def _goals(study: Study, uniform: str, dynamic: str, ours: str) -> str:
     """Returns whether each goal was reached, as a list."""
-    shares = {one: median_interval(study.reaching(ours, uniform, one)) for one in FAMILIES}
+    shares, own = (
+        {one: median_interval(study.reaching(arm, uniform, one)) for one in FAMILIES}
+        for arm in (ours, uniform)
+    )
     reached = [one for one, share in shares.items() if share.estimate <= HALF]
-    said = ", ".join(f"{one} {_shown(share, 2)}" for one, share in shares.items())
+    said = ", ".join(
+        f"{one} {_shown(share, 2)} (uniform itself {own[one].estimate:.2f})"
+        for one, share in shares.items()
+    )
     equal, fewer = (
         difference_of(study.at(ours, 1.0), study.at(dynamic, share), True).interval()
         for share in (1.0, BUDGET)
@@ -275,8 +281,9 @@ def _goals(study: Study, uniform: str, dynamic: str, ours: str) -> str:
     best = min(betas, key=lambda name: float(facts[name].mean()))
     parts = {
         name: mean_of((facts["error of belief"] / facts[name]).to_numpy()).interval()
-        for name in (betas[0], best)
+        for name in dict.fromkeys((betas[0], best))
     }
+    blind = mean_of((facts["error of belief, no features"] / facts[best]).to_numpy()).interval()
     errors = "; ".join(f"{_shown(one, 2)} of `{name[9:]}`" for name, one in parts.items())
     verdict = {True: "reached", False: "not reached"}
     against = "undecided" if fewer.low < 0 <= fewer.high else verdict[fewer.low >= 0]
@@ -288,7 +295,8 @@ def _goals(study: Study, uniform: str, dynamic: str, ours: str) -> str:
             f"- Not below dynamic sampling that has {BUDGET:.0%} of the rollouts: "
             f"**{against}**, {_shown(fewer)}; at equal rollouts {_shown(equal)}.",
             "- Squared errors of predictions 10 % below the Beta posteriors', on uniform's "
-            f"prompts: **{right}**, {errors}.",
+            f"prompts: **{right}**, {errors}; without features, as the Beta posteriors are, "
+            f"{_shown(blind, 2)} of `{best[9:]}`.",
         ]
     )
 

@@ -87,7 +87,7 @@ class ProblemProposer(Curriculum):
         """Draws at least ``count`` levels, P at a time, by choices [times, 1, P] of the policy.
 
         Returns:
-            What the policy sees [1], the choices, and their bins and levels [1, times * P].
+            What the policy observes [1], its actions, and their bins and levels [1, times * P].
         """
         if len(streams) != 1:
             raise ValueError(f"a Proposer learns from one Solver, got {len(streams)}")

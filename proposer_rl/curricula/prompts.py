@@ -153,6 +153,7 @@ class BetaSampling(ItemCurriculum):
 
     def draw(self, own: dict[str, Tensor], count: int, generator: torch.Generator) -> Tensor:
         """Draws the items nearest to the aim."""
+        # What is public, torch.distributions, takes no generator.
         a, b = (torch._standard_gamma(own[name], generator=generator) for name in ("a", "b"))
         return nearest(a / (a + b) - self._aim, count, generator)
 

@@ -103,7 +103,7 @@ class Labelled(Bins):
         return torch.where(share < 0.5, a, b)
 
     def columns(self, values: Tensor, scaled: Tensor) -> Tensor:
-        """Returns whether values [*B] are each of the choices: float64 [*B, c]."""
+        """Returns which of the listed values [*B] are, 1 or 0: float64 [*B, c]."""
         return one_hot(values, len(self.labels)).double()
 
     def moved(self, old: Tensor, noise: Tensor) -> Tensor:

@@ -85,9 +85,8 @@ class TeacherSampler(Sampler[int]):
         self._teacher, self._length = teacher, length
         self._repeat, self._group, self._rounds = repeat, group, rounds
         self._out: dict[int, list[int]] = defaultdict(list)  # tickets of each item
-        self._came: dict[
-            int, list[Answer | None]
-        ] = {}  # answers to items of which more are to come
+        # Answers to items of which more are to come.
+        self._came: dict[int, list[Answer | None]] = {}
         self._epoch, self._goes_on = Epoch(), False  # whether the next one is the rest of it
         self._asked, self._trace = 0, 0  # how many items since the start, and a checksum of them
         self._check: float = 0  # how many there must be for the next look at what is missing
@@ -155,8 +154,9 @@ class TeacherSampler(Sampler[int]):
         """Returns means over the groups that were complete since the last call.
 
         ``success``; what the curriculum had ``predicted`` of it, if it has a belief; ``yield``, the
-        share of groups whose answers differ; ``no_variance``, that of all others; and the same by
-        source, as ``yield/SOURCE``. Nothing, if there was no group.
+        share of groups whose answers differ, of which a mean between 0 and 1 is taken for one;
+        ``no_variance``, that of all others; and the same by source, as ``yield/SOURCE``. Nothing
+        if there was no group.
         """
         shown: dict[str, float] = {}
         for of, (groups, success, mixed, predicted, known) in self._sums.items():

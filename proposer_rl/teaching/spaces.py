@@ -298,9 +298,13 @@ class Items(LevelSpace):
             )
         self.pass_rates = None if pass_rates is None else _rates(pass_rates, count)
         self.expected = None if self.pass_rates is None else expected_log_odds(self.pass_rates)
-        known = [torch.zeros(count, 0)] if features is None else [few_columns(lines)]
-        known += [] if self.pass_rates is None else [rate_columns(self.pass_rates)]
-        self._inputs = torch.cat(known, 1)
+        rates = torch.zeros(count, 0)
+        if self.pass_rates is not None:
+            rates = rate_columns(self.pass_rates)
+        known = torch.zeros(count, 0)
+        if features is not None:
+            known = few_columns(lines, others=rates.shape[1])
+        self._inputs = torch.cat([known, rates], 1)
         low, high = lines.amin(0), lines.amax(0)
         self.coordinates = (2 * (lines - low) / (high - low).clamp_min(1e-12) - 1).float()
         parts: dict[str, _SomeItems] = {}
@@ -336,8 +340,9 @@ class Items(LevelSpace):
     def inputs(self, levels: TensorDictBase) -> Tensor:
         """Returns what a belief knows of items, float32 [*B, D]: ranks, from -1 to 1.
 
-        Of more than 24 features they are those of the first 24 principal components. A place in a
-        list says nothing, so that D is 0 without features and pass rates.
+        A belief takes 24. Where there is no room for all features beside the pass rates, they are
+        those of the first principal components. A place in a list says nothing, so that D is 0
+        without features and pass rates.
         """
         return self._inputs[levels["item"]]
 

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from proposer_rl.curricula.belief import WIDEST
 from proposer_rl.settings import ArgumentError, shown
 
 MOST_TEXTS = 256  # that differ in a column, which is a category
-WIDEST = 24  # columns of inputs
 OUTLIER = 3.0  # standard deviations, beyond which a number of many counts as that
 ANSWERS = 16.0  # that a pass rate is taken for the mean of
 
@@ -118,20 +118,22 @@ def ranks(table: Tensor) -> Tensor:
     return torch.empty_like(middle).scatter_(1, order, middle).mT.contiguous()
 
 
-def few_columns(table: Tensor) -> Tensor:
+def few_columns(table: Tensor, others: int = 0) -> Tensor:
     """Returns ranks [N, D], of wide tables those of their first principal components.
 
     Args:
         table: finite numbers [N, D].
+        others: columns that a belief gets beside them, which would project what is wider.
 
     Returns:
-        float32 [N, min(D, WIDEST)].
+        float32 [N, min(D, WIDEST - others)].
     """
-    if table.shape[1] <= WIDEST:
+    most = WIDEST - others
+    if table.shape[1] <= most:
         return ranks(table)
     own = table.float() - table.float().mean(0)
     own = (own / own.std(0).clamp_min(1e-12)).clamp(-OUTLIER, OUTLIER)
-    vectors = torch.linalg.eigh((own.mT @ own).double()).eigenvectors[:, -WIDEST:].flip(1)
+    vectors = torch.linalg.eigh((own.mT @ own).double()).eigenvectors[:, -most:].flip(1)
     return ranks(own @ vectors.float())
 
 
