@@ -172,7 +172,8 @@ class TeacherSampler(Sampler[int]):
         return {
             "groups": [self._repeat, self._group, self._rounds],
             "out": {item: list(tickets) for item, tickets in self._out.items() if tickets},
-            "came": {item: list(answers) for item, answers in self._came.items()},
+            # torch.load(weights_only=True) takes tuples, none that have names.
+            "came": {i: [one and tuple(one) for one in each] for i, each in self._came.items()},
             "drawn": list(self._epoch.drawn),
             "place": self._epoch.place,
         }

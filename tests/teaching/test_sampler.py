@@ -172,7 +172,8 @@ def test_an_epoch_goes_on_from_every_place() -> None:
     states: list[Any] = []
 
     def save() -> None:
-        states.append([through_torch(teacher.state_dict()), through_json(sampler.state_dict())])
+        whole = through_torch([teacher.state_dict(), sampler.state_dict()])
+        states.append([whole[0], through_json(whole[1])])
 
     save()
     whole = rest(sampler, save=save)
