@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 
 DT = 0.1  # seconds of a step
 APART = 1.0  # metres between two edges of the terrain
@@ -28,21 +25,19 @@ class RobotEnv(BatchedEnv):
     the way.
     """
 
-    state_size: ClassVar[int] = 5
-    observation_size: ClassVar[int] = 8
-    forces: ClassVar[int] = 3
-    draws: ClassVar[int] = 3
+    state_size = 5
+    observation_size = 8
+    forces = 3
+    draws = 3
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
         """Returns place, speed, height of the foot, lean and its speed: near rest."""
         place, lean, turning = chance.unbind(-1)
         none = torch.zeros_like(place)
         state = [0.5 * APART * place, none, none, 0.1 * lean - 0.05, 0.1 * turning - 0.05]
         return torch.stack(state, -1)
 
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns where the robot is after a step of Euler's method."""
         place, speed, foot, lean, turning = state.unbind(-1)
         push, lift, turn = action.unbind(-1)
@@ -64,7 +59,7 @@ class RobotEnv(BatchedEnv):
         state = torch.stack([moved, speed, foot, lean, turning], -1)
         return Step(state, reward, fell, far & ~fell)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns what a robot feels and sees, each about -1 to 1."""
         place, speed, foot, lean, turning = state.unbind(-1)
         ahead = 1 - (place / APART).frac()

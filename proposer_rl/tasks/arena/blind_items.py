@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, uniform
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values, uniform
 
 ITEMS, SYMBOLS, ANSWERS, LONGEST = 200, 24, 4, 17
 
@@ -30,30 +27,24 @@ class BlindItemsEnv(BatchedEnv):
     last right one does so with 1.
     """
 
-    state_size: ClassVar[int] = 1
-    observation_size: ClassVar[int] = SYMBOLS + 1
-    actions: ClassVar[int | None] = ANSWERS
+    state_size = 1
+    observation_size = SYMBOLS + 1
+    actions = ANSWERS
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns the word's beginning."""
-        return torch.zeros_like(level["item"], dtype=torch.float32).unsqueeze(-1)
-
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns the place of the next symbol."""
         right = action == _ANSWER.to(action.device)[self._symbol(state, level)]
         state = state + 1
         solved = right & (state.squeeze(-1) >= _LENGTH.to(action.device)[level["item"].long()])
         return Step(state, solved.float(), solved | ~right, solved)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns the symbol to answer, and the share of the longest word that is still to come."""
         left = _LENGTH.to(state.device)[level["item"].long()].unsqueeze(-1) - state
         symbol = functional.one_hot(self._symbol(state, level), SYMBOLS)
         return torch.cat([symbol, left / LONGEST], -1)
 
     @staticmethod
-    def _symbol(state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def _symbol(state: Tensor, level: Values) -> Tensor:
         place = state.squeeze(-1).long().clamp(max=LONGEST - 1)
         return _ASKED.to(state.device)[level["item"].long(), place]

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 
 # What is seen of a level, with the middle and half the width of its usual range.
 PHYSICS = {
@@ -31,18 +28,16 @@ class CartEnv(BatchedEnv):
     it has does nothing. Every step returns 1. Success is to survive them all.
     """
 
-    state_size: ClassVar[int] = 4
-    observation_size: ClassVar[int] = 4 + len(PHYSICS)
-    actions: ClassVar[int | None] = 2
-    draws: ClassVar[int] = 4
+    state_size = 4
+    observation_size = 4 + len(PHYSICS)
+    actions = 2
+    draws = 4
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
         """Returns place, speed, angle and its speed, each within a twentieth of 0."""
         return 0.1 * chance - 0.05
 
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns where cart and pole are after a step of Euler's method."""
         place, speed, angle, turning = state.unbind(-1)
         total, moment = level["cart"] + level["pole"], level["pole"] * level["length"]
@@ -58,7 +53,7 @@ class CartEnv(BatchedEnv):
         lost = (state[..., 0].abs() > EDGE) | (state[..., 2].abs() > FALLEN)
         return Step(state, torch.ones_like(place), lost, ~lost)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns the state and the physics, each about -1 to 1."""
         physics = [(level[name] - middle) / half for name, (middle, half) in PHYSICS.items()]
         scale = state.new_tensor([EDGE, 2.0, FALLEN, 2.0])

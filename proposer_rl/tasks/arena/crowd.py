@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 
 LANES = (0.2, 0.4, 0.6, 0.8)  # where they walk from left to right or back
 THICK = 0.05
@@ -23,18 +20,16 @@ class CrowdEnv(BatchedEnv):
     with 1.
     """
 
-    state_size: ClassVar[int] = 1 + len(LANES)  # how far across, and where the others are
-    observation_size: ClassVar[int] = 4 + 2 * len(LANES)
-    actions: ClassVar[int | None] = 2  # wait or go forward
-    draws: ClassVar[int] = len(LANES)
+    state_size = 1 + len(LANES)  # how far across, and where the others are
+    observation_size = 4 + 2 * len(LANES)
+    actions = 2  # wait or go forward
+    draws = len(LANES)
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
         """Returns the lower end, and others anywhere in their lanes."""
         return torch.cat([torch.zeros_like(chance[..., :1]), 2 * chance - 1], -1)
 
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns where everybody is after a step; the others' are of any length up to twice."""
         y = state[..., 0] + level["pace"] * action
         ways = 1 - 2 * (torch.arange(len(LANES), device=y.device) % 2)
@@ -45,7 +40,7 @@ class CrowdEnv(BatchedEnv):
         state = torch.cat([y.unsqueeze(-1), others], -1)
         return Step(state, across.float(), hit | across, across)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns how far it is, the level, where the others are, and how far it is to each."""
         y, others = state[..., :1], state[..., 1:]
         scaled = [20 * level["pace"] - 1, 10 * level["speed"] - 1, 4 * level["size"] - 1]

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 
 LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE = range(6)  # and 6, which does nothing
 OPEN, CLOSED, LOCKED = range(3)
@@ -26,12 +23,12 @@ class DoorkeyEnv(BatchedEnv):
     corner. Actions, rewards and the view of 7 by 7 cells are MiniGrid's, too.
     """
 
-    state_size: ClassVar[int] = 9  # wall, its door and how that is, key or -1, place, way, steps
-    observation_size: ClassVar[int] = 3 * VIEW**2
-    actions: ClassVar[int | None] = 7
-    draws: ClassVar[int] = 5
+    state_size = 9  # wall, its door and how that is, key or -1, place, way, steps
+    observation_size = 3 * VIEW**2
+    actions = 7
+    draws = 5
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
         """Returns a map, whose door is locked."""
         size, share = level["size"], chance.unbind(-1)
         rows = size - 2
@@ -45,9 +42,7 @@ class DoorkeyEnv(BatchedEnv):
         way, steps = (4 * share[4]).long(), torch.zeros_like(door)
         return torch.stack([wall, door, steps + LOCKED, *inside, way, steps], -1).float()
 
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns what the action does to the agent, the key and the door."""
         wall, door, how, key_x, key_y, x, y, way, steps = state.unbind(-1)
         to_x, to_y = x + _aside(way + 1), y + _aside(way)
@@ -71,7 +66,7 @@ class DoorkeyEnv(BatchedEnv):
         reward = there * (1 - 0.9 * steps / self.max_steps)
         return Step(torch.stack(following, -1), reward, there, there)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns MiniGrid's numbers of what is seen ahead, from far to near and left to right."""
         x, y, way = (state[..., place, None, None] for place in (5, 6, 7))
         numbers = torch.arange(VIEW, device=state.device)
@@ -94,7 +89,7 @@ def _aside(way: Tensor) -> Tensor:
 
 
 def _things(
-    state: Tensor, level: Mapping[str, Tensor], x: Tensor, y: Tensor
+    state: Tensor, level: Values, x: Tensor, y: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Returns whether a wall, the key, the door and the goal is in each of the cells [*B, ...]."""
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 
 STEPS, STEER, GUST = 20, 0.1, 0.05
 
@@ -21,17 +18,15 @@ class FerryEnv(BatchedEnv):
     ``width`` when the other bank is reached.
     """
 
-    state_size: ClassVar[int] = 2  # how far aside, and across
-    observation_size: ClassVar[int] = 4
-    draws: ClassVar[int] = 1
+    state_size = 2  # how far aside, and across
+    observation_size = 4
+    draws = 1
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
         """Returns a place on the bank, about opposite the dock."""
         return torch.cat([0.4 * chance - 0.2, torch.zeros_like(chance)], -1)
 
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns the next place."""
         drift = STEER * (level["current"] + action[..., 0]) + GUST * (2 * chance[..., 0] - 1)
         aside, across = state[..., 0] + drift, state[..., 1] + 1
@@ -39,7 +34,7 @@ class FerryEnv(BatchedEnv):
         landed = over & (aside.abs() < level["width"] / 2)
         return Step(torch.stack([aside, across], -1), landed.float(), over, landed)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns how far aside and across, current and width, each about -1 to 1."""
         aside, across = state.unbind(-1)
         seen = [aside, across / 10 - 1, level["current"], level["width"] - 1]

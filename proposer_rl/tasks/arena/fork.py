@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 
 DEEP = 0.97  # from which depth on the reward is at the left
 
@@ -21,24 +18,18 @@ class ForkEnv(BatchedEnv):
     round, which is told by the depth that is seen alone.
     """
 
-    state_size: ClassVar[int] = 1
-    observation_size: ClassVar[int] = 3
-    actions: ClassVar[int | None] = 2
+    state_size = 1
+    observation_size = 3
+    actions = 2
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns the middle."""
-        return chance.new_zeros(*self.batch_size, 1)
-
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns the next cell: action 1 leads to the right, 0 to the left."""
         place = state.squeeze(-1) + 2 * action - 1
         right_way = torch.where(level["depth"] > DEEP, -place, place)
         end, trap = right_way >= level["length"], right_way <= -2
         return Step(place.unsqueeze(-1), end.float(), end | trap, end)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns the place, the depth and the length, each about -1 to 1."""
         place = state.squeeze(-1) / 10
         return torch.stack([place, 2 * level["depth"] - 1, level["length"] / 5 - 1], -1)

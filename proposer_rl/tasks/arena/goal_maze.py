@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 
 STRIDE = 0.3
 BORDER, BLOCK = 7.0, 5.0  # the floor ends at the first, and begins at the second
@@ -22,18 +19,16 @@ class GoalMazeEnv(BatchedEnv):
     1 as soon as the point is nearer to the goal (``x``, ``y``) than ``tolerance``, and 0 else.
     """
 
-    state_size: ClassVar[int] = 2
-    observation_size: ClassVar[int] = 5
-    forces: ClassVar[int] = 2
-    draws: ClassVar[int] = 2
+    state_size = 2
+    observation_size = 5
+    forces = 2
+    draws = 2
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
         """Returns a place in the corner."""
         return (BORDER - BLOCK) * chance - BORDER
 
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns the next place, which walls hold up along the axis on which they were met."""
         length = action.norm(dim=-1, keepdim=True).clamp(min=1)
         place = (state + STRIDE * action / length).clamp(-BORDER, BORDER)
@@ -44,7 +39,7 @@ class GoalMazeEnv(BatchedEnv):
         there = (goal - place).norm(dim=-1) < level["tolerance"]
         return Step(place, there.float(), there, there)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns the place, the goal and the tolerance, each from -1 to 1."""
         seen = torch.stack([level["x"], level["y"], level["tolerance"] - REACH], -1)
         return torch.cat([state, seen], -1) / REACH

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 
 
 class HillEnv(BatchedEnv):
@@ -18,19 +15,17 @@ class HillEnv(BatchedEnv):
     with 1 on the top, and returns 0 else.
     """
 
-    state_size: ClassVar[int] = 2
-    observation_size: ClassVar[int] = 3
-    actions: ClassVar[int | None] = 3
-    draws: ClassVar[int] = 1
+    state_size = 2
+    observation_size = 3
+    actions = 3
+    draws = 1
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
         """Returns a place near the bottom, at rest."""
         place = -0.6 + 0.2 * chance
         return torch.cat([place, torch.zeros_like(place)], -1)
 
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns the car's next place and speed."""
         place, speed = state.unbind(-1)
         push = (action - 1) * level["force"] - 0.0025 * (3 * place).cos()
@@ -40,7 +35,7 @@ class HillEnv(BatchedEnv):
         top = place >= 0.5
         return Step(torch.stack([place, speed], -1), top.float(), top, top)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns place, speed and the engine's force, each about -1 to 1."""
         place, speed = state.unbind(-1)
         return torch.stack([place + 0.3, speed / 0.07, level["force"] / 0.003 - 1], -1)

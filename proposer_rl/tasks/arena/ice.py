@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 
 AHEAD, LEFT, RIGHT, WAIT = range(4)
 SINK = -0.1  # what a pit costs
@@ -21,18 +18,16 @@ class IceEnv(BatchedEnv):
     end pays 1 and a pit slightly less than nothing, which is what is left when time is over.
     """
 
-    state_size: ClassVar[int] = 2
-    observation_size: ClassVar[int] = 5
-    actions: ClassVar[int | None] = 4
-    draws: ClassVar[int] = 2
+    state_size = 2
+    observation_size = 5
+    actions = 4
+    draws = 2
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
         """Returns the first cell of the middle."""
         return torch.stack([torch.zeros_like(level["slip"]), level["width"] // 2], -1).float()
 
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns the next cell."""
         along, across = state.unbind(-1)
         aside = torch.where(chance[..., 1] < 0.5, LEFT, RIGHT)
@@ -43,7 +38,7 @@ class IceEnv(BatchedEnv):
         end = along >= level["length"]
         return Step(torch.stack([along, across], -1), end + SINK * pit, pit | end, end)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns the cells to the end and to each side, the width and slip, about 0 to 1."""
         along, across = state.unbind(-1)
         left, right = across / 4, (level["width"] - 1 - across) / 4

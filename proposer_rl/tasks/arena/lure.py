@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 
 STRIDE, NEAR = 0.2, 0.3
 
@@ -21,18 +18,16 @@ class LureEnv(BatchedEnv):
     start. A step returns how much nearer it gets; the goal ends the episode, with 1 more.
     """
 
-    state_size: ClassVar[int] = 2
-    observation_size: ClassVar[int] = 5
-    forces: ClassVar[int] = 2
-    draws: ClassVar[int] = 1
+    state_size = 2
+    observation_size = 5
+    forces = 2
+    draws = 1
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
         """Returns a place near the origin."""
         return torch.cat([torch.zeros_like(chance), 0.2 * chance - 0.1], -1)
 
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns the next place: first along x, then along y, unless a wall is in between."""
         x, y = state.unbind(-1)
         new_x, new_y = (state + STRIDE * action).unbind(-1)
@@ -46,7 +41,7 @@ class LureEnv(BatchedEnv):
         there = after < NEAR
         return Step(torch.stack([new_x, new_y], -1), before - after + there, there, there)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns the place, and the trap's depth, distance and width, each about -1 to 1."""
         seen = [level["depth"] - 1, level["distance"] / 2 - 2, level["width"] - 1]
         return torch.cat([state / 2, torch.stack(seen, -1)], -1)

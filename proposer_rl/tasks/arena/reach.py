@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 
 FAR = 4.0  # about the largest distance
 RADIUS = 0.3  # of the goal
@@ -23,17 +20,11 @@ class ReachEnv(BatchedEnv):
     little, so that failures differ.
     """
 
-    state_size: ClassVar[int] = 4
-    observation_size: ClassVar[int] = 6
-    forces: ClassVar[int] = 2
+    state_size = 4
+    observation_size = 6
+    forces = 2
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns the origin, at rest."""
-        return chance.new_zeros(*self.batch_size, 4)
-
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns the point's next place and velocity."""
         velocity = DRAG * state[..., 2:] + THRUST * action
         place = state[..., :2] + velocity
@@ -41,14 +32,14 @@ class ReachEnv(BatchedEnv):
         reward = there.float() - COST * action.square().sum(-1)
         return Step(torch.cat([place, velocity], -1), reward, there, there)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns where the goal is and lies from here, and the velocity, each about -1 to 1."""
         there, top = goal(level), THRUST / (1 - DRAG)
         apart = there - state[..., :2]
         return torch.cat([there / FAR, apart / FAR, state[..., 2:] / top], -1)
 
 
-def goal(level: Mapping[str, Tensor]) -> Tensor:
+def goal(level: Values) -> Tensor:
     """Returns where the goals of levels [*B] lie, float [*B, 2]."""
     turn = torch.pi * level["direction"]
     return level["distance"].unsqueeze(-1) * torch.stack([turn.cos(), turn.sin()], -1)

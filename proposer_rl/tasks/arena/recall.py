@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 
 DOORS, LONGEST = 4, 12
 
@@ -22,19 +19,17 @@ class RecallEnv(BatchedEnv):
     last cell alone; the right one returns 1.
     """
 
-    state_size: ClassVar[int] = 3  # cell, door, number that is shown or -1
-    observation_size: ClassVar[int] = DOORS + 4
-    actions: ClassVar[int | None] = 1 + DOORS
-    draws: ClassVar[int] = 2
+    state_size = 3  # cell, door, number that is shown or -1
+    observation_size = DOORS + 4
+    actions = 1 + DOORS
+    draws = 2
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
         """Returns the first cell, where the door is shown."""
         door = (DOORS * chance[..., 0]).floor()
         return torch.stack([torch.zeros_like(door), door, door], -1)
 
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns the next cell, or the end behind a door."""
         cell, door, shown = state.unbind(-1)
         last = level["length"] - 1
@@ -46,7 +41,7 @@ class RecallEnv(BatchedEnv):
         shown = torch.where(cell > 0, other, shown)
         return Step(torch.stack([cell, door, shown], -1), right.float(), left, right)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns what is shown, whether here is the first or the last cell, and the level."""
         cell, _, shown = state.unbind(-1)
         number = functional.one_hot(shown.long() + 1, 1 + DOORS)[..., 1:]

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 
 FIRST, LAST = 2.0, 16.0  # where the first stump begins, and where the track ends
 WIDTH, CLEARANCE = 0.5, 0.2  # of a stump, and how low ones a stride steps over
@@ -26,19 +23,17 @@ class StumpsEnv(BatchedEnv):
     episode; the end of the track is a success.
     """
 
-    state_size: ClassVar[int] = 5  # place, height, speed along and upwards, rest
-    observation_size: ClassVar[int] = 9
-    forces: ClassVar[int] = 2
-    draws: ClassVar[int] = 1
+    state_size = 5  # place, height, speed along and upwards, rest
+    observation_size = 9
+    forces = 2
+    draws = 1
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
         """Returns a walker at the beginning, at rest."""
         nothing = torch.zeros_like(chance).expand(*chance.shape[:-1], 4)
         return torch.cat([nothing, 1 + 0 * chance], -1)
 
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns where the walker is after a step, and whether it has fallen."""
         x, y, along, upwards, rest = state.unbind(-1)
         stands = y <= 0
@@ -55,7 +50,7 @@ class StumpsEnv(BatchedEnv):
         state = torch.stack([to_x, y, along, upwards, rest], -1)
         return Step(state, reward, falls | there, there)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns the walker, the stump below and the next one, and the level, about -1 to 1."""
         x, y, along, upwards, rest = state.unbind(-1)
         over, ahead = _stumps(x, level)
@@ -64,7 +59,7 @@ class StumpsEnv(BatchedEnv):
         return torch.stack([*walker, *track], -1)
 
 
-def _stumps(x: Tensor, level: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+def _stumps(x: Tensor, level: Values) -> tuple[Tensor, Tensor]:
     """Returns whether there is a stump at a place, and how far it is to where the next begins."""
     period = level["spacing"] + WIDTH
     phase = (x - FIRST) % period

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 
 GRAVITY, FASTEST = 10.0, 8.0  # as in Gymnasium's Pendulum-v1
 SECONDS = 0.06  # of a step
@@ -23,18 +20,16 @@ class SwingEnv(BatchedEnv):
     upright in all of the last :data:`HELD` steps.
     """
 
-    state_size: ClassVar[int] = 3  # angle, speed, steps upright
-    observation_size: ClassVar[int] = 6
-    draws: ClassVar[int] = 1
+    state_size = 3  # angle, speed, steps upright
+    observation_size = 6
+    draws = 1
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
         """Returns a pendulum that hangs about straight down, at rest."""
         angle = torch.pi + chance - 0.5
         return torch.cat([angle, torch.zeros_like(angle), torch.zeros_like(angle)], -1)
 
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns the pendulum's next angle and speed."""
         angle, speed, held = state.unbind(-1)
         mass, length = level["mass"], level["length"]
@@ -48,7 +43,7 @@ class SwingEnv(BatchedEnv):
         never = torch.zeros_like(held, dtype=torch.bool)
         return Step(torch.stack([angle, speed, held], -1), reward, never, held >= HELD)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns the angle's cosine and sine, the speed and the level, each about -1 to 1."""
         angle, speed, _ = state.unbind(-1)
         own = [level["mass"] - 1, level["length"] - 1, level["torque"] / 4 - 1]

@@ -20,6 +20,9 @@ SHIFT, MIX = (30, 27, 31), (-0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15)  # SplitMi
 STEP, ENTRY = -0x61C8864680B583EB, 0x632BE59BD9B4E019  # odd, and without a pattern
 UNIT = 2.0**-24  # between neighbouring numbers of :func:`uniform`
 
+Values = Mapping[str, Tensor]
+"""A level's parameters by name, [*B] each: float, or int64 where the values are whole numbers."""
+
 
 class Step(NamedTuple):
     """What a step leads to, in an environment of batch shape [*B].
@@ -42,10 +45,10 @@ class BatchedEnv(EnvBase):
     """An environment whose levels are named numbers, and that steps a batch [*B] of them at once.
 
     A class of one's own has to say how large things are (``state_size``, ``observation_size``, and
-    ``actions`` or ``forces``), and to define :meth:`begin`, :meth:`advance`, and :meth:`observe`
-    where a Solver does not see the state alone. Nothing in these may be kept between calls. An
-    episode is truncated after ``max_steps``; its success is the entry ``"success"``, and
-    ``"is_init"`` is whether it begins.
+    ``actions`` or ``forces``), and to define :meth:`advance`, :meth:`begin` where a state is more
+    than zeros, and :meth:`observe` where a Solver does not see the state alone. Nothing in these
+    may be kept between calls. An episode is truncated after ``max_steps``; its success is the entry
+    ``"success"``, and ``"is_init"`` is whether it begins.
 
     Whatever is random comes from the level's ``seed`` and the number of the step, so that an
     episode's chances are the level's own: equal levels and actions make equal episodes.
@@ -107,39 +110,33 @@ class BatchedEnv(EnvBase):
         }
         self._level = {name: entry.clone() for name, entry in self._next.items()}
 
-    @abstractmethod
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns the state that episodes begin in, float [*B, S].
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
+        """Returns the state that episodes begin in, float [*B, S]; here zeros.
 
         Args:
-            level: each parameter by name, float [*B], or int64 where its values are whole numbers.
+            level: that begins.
             chance: ``draws`` uniform numbers from 0 to 1, float [*B, draws].
         """
+        return torch.zeros(*self.batch_size, self.state_size, device=self.device)
 
     @abstractmethod
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns what an action leads to.
 
         Args:
             state: float [*B, S].
             action: int64 [*B], or float [*B, forces] from -1 to 1.
-            level: as of :meth:`begin`.
+            level: that is played.
             chance: as of :meth:`begin`, others at every step.
         """
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns what a Solver sees, float [*B, observation_size]; here the state."""
         return state
 
     @classmethod
-    def features(cls, level: Mapping[str, Tensor]) -> Tensor:
-        """Returns what else a model of outcomes knows of levels, float [*B, F]; here nothing.
-
-        Args:
-            level: each parameter by name, [*B].
-        """
+    def features(cls, level: Values) -> Tensor:
+        """Returns what else a model of outcomes knows of levels, float [*B, F]; here nothing."""
         return next(iter(level.values())).unsqueeze(-1)[..., :0]
 
     def set_levels(self, levels: TensorDictBase) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, ClassVar
+from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 from proposer_rl.learning import SolverSettings, in_first_episode
 from proposer_rl.settings import settings
 from proposer_rl.task import ComputeContext
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 from proposer_rl.tasks.batched_envs.task import BatchedTask
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings
 from proposer_rl.tasks.ranges import RangeSettings
@@ -59,19 +59,17 @@ class PointMassEnv(BatchedEnv):
         tensor([ 2.9325, -1.5000])
     """
 
-    state_size: ClassVar[int] = 4 + len(GATE)
-    observation_size: ClassVar[int] = state_size
-    forces: ClassVar[int] = 2
+    state_size = 4 + len(GATE)
+    observation_size = state_size
+    forces = 2
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
         """Returns the mass at rest, with its level."""
         x, y = (torch.full_like(level[GATE[0]], place) for place in START_PLACE)
         rest = torch.zeros_like(x)
         return torch.stack([x, rest, y, rest, *(level[name] for name in GATE)], -1)
 
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns where the mass is after ten substeps."""
         place, speed, hit = after_substeps(state, action)
         away = torch.hypot(place[0] - GOAL_PLACE[0], place[1] - GOAL_PLACE[1])
