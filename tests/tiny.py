@@ -32,13 +32,15 @@ from proposer_rl.tasks.mazes.maze_settings import (
 from proposer_rl.tasks.mazes.task import MazeTask
 from proposer_rl.tasks.point_masses.task import GateSettings, PointMassTask
 from proposer_rl.tasks.ranges import RangeSettings
-from proposer_rl.tasks.view_mazes.task import ViewMazeTask
-from proposer_rl.tasks.view_mazes.view_settings import (
-    PerfectSettings,
-    ScatteredSettings,
+from proposer_rl.tasks.view_mazes.task import (
     ViewEvaluationSettings,
     ViewMazeSettings,
+    ViewMazeTask,
     ViewNetworkSettings,
+)
+from proposer_rl.tasks.view_mazes.view_distributions import (
+    PerfectSettings,
+    ScatteredSettings,
     ViewSpaceSettings,
 )
 

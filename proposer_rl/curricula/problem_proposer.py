@@ -19,7 +19,7 @@ from proposer_rl.curricula.first_order import SampledFirstOrderCurriculum, align
 from proposer_rl.curricula.proposer import learnt_proposer
 from proposer_rl.curricula.student import Student, TaskStudent
 from proposer_rl.learning import PPOSettings, load_agent, located
-from proposer_rl.learning.divergence import require_finite
+from proposer_rl.learning.objective import require_finite
 from proposer_rl.meta.first_order import TargetMeasure
 from proposer_rl.models import ActorCritic, draw_at
 from proposer_rl.settings import Count, Decay, Positive, checked

@@ -1,15 +1,18 @@
-"""What PPO maximises, for K replicas at once: advantages, the clipped loss, clipped gradients.
+"""What PPO maximises, for K replicas at once: its numbers, advantages, the clipped loss, gradients.
 
 All of it is TorchRL's, without what would mix replicas or wait for a device; what is reported of a
-step is of each replica by itself.
+step is of each replica by itself, and refused where it is not finite. A rule that joins several
+settings stands where the object is built that needs it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Ge, Gt, Interval
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
@@ -19,8 +22,82 @@ from torchrl.objectives.value import GAE
 from torchrl.objectives.value.functional import reward2go
 
 from proposer_rl.models import ActorCritic
+from proposer_rl.settings import settings
 
 LEAST_DISCOUNT = 1e-7  # below it, float32 does not know the next reward from none
+
+
+@settings
+class LearningSettings:
+    """PPO's numbers but for the horizon; the defaults are the paper's for the Solver.
+
+    Attributes:
+        updates: updates on one batch; each computes advantages anew, then runs ``epochs``.
+        epochs: passes of an update through its batch, each a gradient step where the batch is not
+            cut in parts.
+        learning_rate, adam_eps: Adam's step size and denominator offset.
+        gamma, lmbda: discount, and GAE's weight of longer returns (Schulman et al. 2016, eq. 16).
+        clip_epsilon: the ratio is clipped to 1 +- this (Schulman et al. 2017, eq. 7).
+        entropy_coeff, critic_coeff: weights of the entropy bonus and of the squared value error.
+        max_grad_norm: largest gradient norm of one copy.
+        normalize_advantage: standardise advantages over what a gradient step of a copy is made on.
+    """
+
+    updates: Annotated[int, Ge(1)] = 1
+    epochs: Annotated[int, Ge(1)] = 8
+    learning_rate: Annotated[float, Gt(0)] = 2.5e-4
+    adam_eps: Annotated[float, Gt(0)] = 1e-5
+    gamma: Annotated[float, Interval(ge=0, le=1)] = 0.99
+    lmbda: Annotated[float, Interval(ge=0, le=1)] = 0.95
+    clip_epsilon: Annotated[float, Interval(gt=0, lt=1)] = 0.2
+    entropy_coeff: Annotated[float, Ge(0)] = 0.01
+    critic_coeff: Annotated[float, Ge(0)] = 0.5
+    max_grad_norm: Annotated[float, Gt(0)] = 1.0
+    normalize_advantage: bool = True
+
+
+@settings
+class PPOSettings(LearningSettings):
+    """PPO's numbers, and how it goes through a batch.
+
+    Attributes:
+        horizon: steps T collected from every environment before an update.
+        continue_episodes: whether episodes go on from rollout to rollout, and a new level begins
+            where one ends; otherwise every rollout begins with its levels.
+        normalize_observations: the numbers that are observed are shown without the mean of all that
+            a replica has trained on, in their standard deviations, cut off at 10 of them.
+        normalize_rewards: values have the standard deviation of the discounted return for a unit,
+            which is the same as rewards divided by it.
+        minibatches: equal parts of a batch, shuffled anew in each epoch, with a gradient step (and
+            standardised advantages) each; 1 for the batch as it is.
+        anneal_updates: the learning rate falls in equal steps, update by update, and would be zero
+            after so many; None for a constant one.
+        anneal_clip: whether ``clip_epsilon`` falls with the learning rate.
+        clip_value: how far a value may move from that of the rollout before its error counts as if
+            it had not come back (the larger of both errors); None for the plain squared error.
+    """
+
+    horizon: Annotated[int, Ge(1)] = 25
+    continue_episodes: bool = False
+    normalize_observations: bool = False
+    normalize_rewards: bool = False
+    minibatches: Annotated[int, Ge(1)] = 1
+    anneal_updates: Annotated[int, Ge(1)] | None = None
+    anneal_clip: bool = False
+    clip_value: Annotated[float, Gt(0)] | None = None
+
+
+@settings
+class SolverSettings:
+    """How the Solver is trained.
+
+    Attributes:
+        batch_size: levels P of an update.
+        ppo: PPO's numbers.
+    """
+
+    batch_size: Annotated[int, Ge(1)] = 128
+    ppo: PPOSettings = PPOSettings()
 
 
 def gae(gamma: float, lmbda: float, value_key: str) -> GAE:
@@ -197,3 +274,64 @@ def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int
     for gradient in gradients:
         gradient.mul_(scale.view(-1, *[1] * (gradient.ndim - 1)))
     return norm
+
+
+class DivergedError(ArithmeticError):
+    """A number is not finite; the message is one line that says which, and in which replica."""
+
+    exit_code = 3
+
+
+def require_finite(
+    reward: Tensor,
+    steps: TensorDictBase,
+    weights: Mapping[str, Tensor],
+    copies: int | None,
+    first: int = 0,
+) -> None:
+    """Checks one update; costs one number read from the device unless something is wrong.
+
+    Args:
+        reward: of the rollout, [B, ...], B the first dimension of the environment.
+        steps: of S gradient steps, [S], the losses ``loss_...`` and the ``grad_norm`` of each
+            replica, [S, K], or without replicas [S].
+        weights: after the update, by name, [K, ...] with replicas.
+        copies: K, or None for a single network.
+        first: number of the first replica, by which replicas are named.
+
+    Raises:
+        DivergedError: naming what was not finite first, and the replicas that it happened in. The
+            others are as they would be without it: nothing is shared between replicas.
+    """
+    # What a gradient step leaves behind, in the order in which it arises.
+    names = [*(key for key in steps.keys() if key.startswith("loss_")), "grad_norm"]
+    scalars = [steps[name] for name in names]
+    # A sum of magnitudes is finite only if all of them are.
+    sums = nn.utils.get_total_norm([reward, *scalars, *weights.values()], norm_type=1.0)
+    if bool(sums.isfinite()):
+        return
+    _require_finite("reward", reward, len(reward), first)
+    for i in range(len(steps)):
+        for name in names:
+            _require_finite(f"{name} of gradient step {i}", steps[name][i], copies, first)
+    for name, weight in weights.items():
+        _require_finite(f"weight {name}", weight, copies, first)
+
+
+@contextmanager
+def located(place: str) -> Iterator[None]:
+    """Says in a :class:`DivergedError` from inside where in the run that was."""
+    try:
+        yield
+    except DivergedError as error:
+        raise DivergedError(f"{place}: {error}") from error
+
+
+def _require_finite(name: str, tensor: Tensor, copies: int | None, first: int) -> None:
+    finite = tensor.detach().isfinite().reshape(copies or 1, -1)
+    if bool(finite.all()):
+        return
+    worst = float(tensor.detach().reshape(-1)[~finite.reshape(-1)][0])
+    which = (first + torch.nonzero(~finite.all(1)).flatten()).tolist()
+    named = "" if copies is None else f"copy {', '.join(map(str, which))}: "
+    raise DivergedError(f"{named}{name} is not finite ({worst})")

@@ -24,18 +24,18 @@ from torchrl.envs import EnvBase
 from torchrl.modules import set_recurrent_mode
 
 from proposer_rl.learning import graphs
-from proposer_rl.learning.divergence import require_finite
 from proposer_rl.learning.objective import (
     ACTED_VALUE,
     CopiesClipLoss,
     MakeLoss,
+    PPOSettings,
     clip_gradients_,
     explained_variance,
     gae,
     make_loss,
     of_copies,
+    require_finite,
 )
-from proposer_rl.learning.ppo_settings import PPOSettings
 from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_values
 from proposer_rl.learning.snapshot import (
     complete_adam,

@@ -9,11 +9,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from proposer_rl.learning.objective import ACTED_VALUE
-from proposer_rl.learning.ppo_settings import PPOSettings
+from proposer_rl.learning.objective import ACTED_VALUE, PPOSettings
 from proposer_rl.learning.rollout import set_values
 from proposer_rl.models import ActorCritic
-from proposer_rl.models.normalization import Normalization
+from proposer_rl.models.actor_critic import Normalization
 from proposer_rl.settings import ArgumentError
 
 

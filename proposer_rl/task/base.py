@@ -28,7 +28,7 @@ from proposer_rl.learning import (
     graphs,
     mean_performance,
 )
-from proposer_rl.models import ActorCritic, Population, normal
+from proposer_rl.models import ActorCritic, Population, memory_actor_critic, normal
 from proposer_rl.runs.records import pixels, png, written
 from proposer_rl.streams import Streams
 from proposer_rl.task.protocols import (
@@ -87,6 +87,9 @@ class Task(ABC):
         reward_scale: that rewards of training were multiplied with; returns are given without it.
         batched: as of :class:`~proposer_rl.models.Population`.
         episodes_at_once: of each Solver, that are played at once in evaluations; None for all.
+        observed: entries that the network is called with, in order.
+        memory: width of the network's memory (:func:`~proposer_rl.models.memory_actor_critic`);
+            None for a network without.
         drop_finished: whether evaluations make environments of fewer levels as others are finished,
             as of :func:`~proposer_rl.learning.mean_performance`.
         replayed: what reads nothing back from a GPU, and so is replayed there as a CUDA graph:
@@ -108,6 +111,8 @@ class Task(ABC):
     reward_scale: float = 1.0
     batched: bool | None = None
     episodes_at_once: int | None = None
+    observed: Sequence[str] = ("observation",)
+    memory: int | None = None
     drop_finished: bool = False
     replayed: Sequence[str] = ()
 
@@ -166,14 +171,18 @@ class Task(ABC):
     def network(self) -> nn.Module:
         """Returns one Solver's network, without buffers, drawn from torch's default generator.
 
-        Where :meth:`actor_critic` is not replaced: from ``observation`` [*B, ...] to logits
-        [*B, A], or locations and log-scales [*B, D, 2] of continuous actions, and values [*B, 1].
+        Where :meth:`actor_critic` is not replaced: from what is ``observed``, [*B, ...] each, to
+        logits [*B, A], or locations and log-scales [*B, D, 2] of continuous actions, and values
+        [*B, 1]; with ``memory`` such as :class:`~proposer_rl.models.MemoryNetwork`.
         """
 
     def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
         """Returns K networks as the agent of an environment [K, P]."""
-        module = TensorDictModule(population, ["observation"], ["logits", "state_value"])
         distribution = distribution_of(env.full_action_spec["action"])
+        if self.memory is not None:
+            observed = self.observed, self.memory
+            return memory_actor_critic(population, *observed, distribution_class=distribution)
+        module = TensorDictModule(population, [*self.observed], ["logits", "state_value"])
         return ActorCritic(module, distribution_class=distribution, copies=population.copies)
 
     def learner(self, streams: Sequence[Streams]) -> PPO:

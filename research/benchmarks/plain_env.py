@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from proposer_rl.tasks.mazes.paths import MOVES
+from proposer_rl.tasks.mazes.levels import MOVES
 
 Observation = dict[str, NDArray[Any]]
 

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from proposer_rl.learning import DivergedError, located
-from proposer_rl.learning.divergence import require_finite
+from proposer_rl.learning.objective import require_finite
 from tests.draws import generators
 from tests.learning.test_ppo import learner
 

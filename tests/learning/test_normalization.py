@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from proposer_rl.curricula import TaskStudent
 from proposer_rl.learning import PPO, PPOSettings, SolverSettings, agent_weights, load_agent
 from proposer_rl.meta.first_order import LevelGradients
-from proposer_rl.models.normalization import FARTHEST, RunningMoments
+from proposer_rl.models.actor_critic import FARTHEST, RunningMoments
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from tests.draws import generators

@@ -8,17 +8,15 @@ from typing import Annotated, ClassVar
 import torch
 from annotated_types import Ge
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Categorical, Unbounded
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning import SolverSettings
-from proposer_rl.models import ActorCritic, Population, memory_actor_critic
 from proposer_rl.settings import ArgumentError
-from proposer_rl.task import ComputeContext, Levels, Task, distribution_of
+from proposer_rl.task import ComputeContext, Levels, Task
 from proposer_rl.tasks.batched_envs.env import BatchedEnv
-from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork, memory_network
+from proposer_rl.tasks.gymnasium.networks import NetworkSettings, solver_network
 from proposer_rl.tasks.gymnasium.player import imported
 from proposer_rl.tasks.ranges import RangeSettings, spaces
 
@@ -60,6 +58,7 @@ class BatchedTask(Task):
         context: ComputeContext,
     ) -> None:
         self._class, self._network = _environment_class(env), network
+        self.memory = network.memory
         self.title = getattr(self, "title", self._class.__name__.removesuffix("Env"))
         if network.memory is not None:
             self.batched = None
@@ -108,18 +107,7 @@ class BatchedTask(Task):
         """Returns two MLPs, of the policy and of the critic, or a network with memory."""
         kind = self._class
         acts = Unbounded(kind.forces) if kind.actions is None else Categorical(kind.actions)
-        make = SolverNetwork if self._network.memory is None else memory_network
-        return make([Unbounded(kind.observation_size)], acts, self._network)
-
-    def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
-        """Returns K networks, with memory or without."""
-        memory = self._network.memory
-        distribution = distribution_of(env.full_action_spec["action"])
-        if memory is not None:
-            seen = ["observation"]
-            return memory_actor_critic(population, seen, memory, distribution_class=distribution)
-        module = TensorDictModule(population, ["observation"], ["logits", "state_value"])
-        return ActorCritic(module, distribution_class=distribution, copies=population.copies)
+        return solver_network([Unbounded(kind.observation_size)], acts, self._network)
 
 
 def _environment_class(name: str) -> type[BatchedEnv]:

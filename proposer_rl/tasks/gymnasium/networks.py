@@ -78,11 +78,15 @@ class SolverNetwork(nn.Module):
         return self.actions(self.policy(features)), self.critic(features)
 
 
-def memory_network(
+def solver_network(
     seen: Sequence[TensorSpec], acts: TensorSpec, settings: NetworkSettings
-) -> MemoryNetwork:
-    """Returns a network with memory: numbers and images, an LSTM, then one hidden layer each."""
-    assert settings.memory is not None
+) -> SolverNetwork | MemoryNetwork:
+    """Returns a :class:`SolverNetwork`, or a network with memory if the settings have one.
+
+    That is numbers and images, an LSTM, then one hidden layer for each head.
+    """
+    if settings.memory is None:
+        return SolverNetwork(seen, acts, settings)
     encoder, actions = Encoder(seen, settings), ActionLogits(acts)
     network = MemoryNetwork(
         encoder,

@@ -16,7 +16,6 @@ from annotated_types import Ge, Gt, Le
 from gymnasium.vector.utils import CloudpickleWrapper
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.envs import (
@@ -32,13 +31,12 @@ from torchrl.envs import (
 
 from proposer_rl.extras import install_command
 from proposer_rl.learning import SolverSettings, in_first_episode
-from proposer_rl.models import ActorCritic, Population, memory_actor_critic
 from proposer_rl.settings import settings
 from proposer_rl.streams import Streams
-from proposer_rl.task import ComputeContext, Task, distribution_of
+from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.gymnasium.answers import SuccessSettings, UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.batched_env import FLAGS, GymnasiumEnv, Vectorization, plays
-from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork, memory_network
+from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork, solver_network
 from proposer_rl.tasks.gymnasium.pictures import FRAMES, NO_FRAMES, Camera
 from proposer_rl.tasks.gymnasium.player import (
     MakeEnvironment,
@@ -166,6 +164,7 @@ class GymnasiumTask(Task):
         with _named(env_id, extra):
             self.max_steps = tried(self._make, parameters, space.bins, plays(first)[0], success)
         self._seen, self._acts = self._specs(first)
+        self.observed, self.memory = list(self._seen), network.memory
         # MLPs as small as these are faster all at once.
         small = all(spec.ndim == 1 for spec in self._seen.values())
         self.batched = True if small and network.memory is None else None
@@ -218,17 +217,7 @@ class GymnasiumTask(Task):
 
     def network(self) -> nn.Module:
         """Returns the network of one Solver, by what the environment shows and takes."""
-        make = SolverNetwork if self._network.memory is None else memory_network
-        return make(list(self._seen.values()), self._acts, self._network)
-
-    def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
-        """Returns K networks, with memory or without."""
-        seen, memory = list(self._seen), self._network.memory
-        distribution = distribution_of(env.full_action_spec["action"])
-        if memory is not None:
-            return memory_actor_critic(population, seen, memory, distribution_class=distribution)
-        module = TensorDictModule(population, seen, ["logits", "state_value"])
-        return ActorCritic(module, distribution_class=distribution, copies=population.copies)
+        return solver_network(list(self._seen.values()), self._acts, self._network)
 
     def evaluation_distribution(self, name: str) -> ParameterSpace:
         """Returns a distribution, of other seeds than the training's."""

@@ -6,9 +6,15 @@ from gymnasium import register
 
 from proposer_rl.tasks.mazes.distributions import LevelDistribution, SpecificationSpace
 from proposer_rl.tasks.mazes.generation import MECHANISMS, generate_levels
-from proposer_rl.tasks.mazes.levels import Level, LevelSpec, planes, validate_levels
+from proposer_rl.tasks.mazes.levels import (
+    Level,
+    LevelSpec,
+    planes,
+    shortest_path_length,
+    successors,
+    validate_levels,
+)
 from proposer_rl.tasks.mazes.maze_env import MazeEnv
-from proposer_rl.tasks.mazes.paths import shortest_path_length, successors
 from proposer_rl.tasks.mazes.rendering import draw_level
 
 __all__ = [

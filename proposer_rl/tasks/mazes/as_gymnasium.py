@@ -14,10 +14,9 @@ from tensordict import TensorDictBase
 
 from proposer_rl.settings import ArgumentError, checked
 from proposer_rl.tasks.mazes.distributions import SpecificationSpace
-from proposer_rl.tasks.mazes.levels import Level, validate_levels
+from proposer_rl.tasks.mazes.levels import MOVES, Level, validate_levels
 from proposer_rl.tasks.mazes.maze_env import MazeEnv
 from proposer_rl.tasks.mazes.maze_settings import Fractions, MazeSettings, Mechanism, PathLengths
-from proposer_rl.tasks.mazes.paths import MOVES
 
 LEVELS_AHEAD = 16  # levels drawn at a time: one costs almost as much as sixteen
 METADATA = {"render_modes": ["rgb_array", "ansi"], "render_fps": 8}

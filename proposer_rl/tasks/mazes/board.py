@@ -32,8 +32,9 @@ from proposer_rl.tasks.mazes.levels import (
     cell_index,
     cell_plane,
     planes,
+    shortest_way,
+    successors,
 )
-from proposer_rl.tasks.mazes.paths import shortest_way, successors
 from proposer_rl.tasks.mazes.rendering import recorded_drawing
 
 DIGITS = 4  # of the numbers of a map: what can be seen
@@ -142,8 +143,7 @@ def shortest_path(level: Level) -> list[list[int]] | None:
 
     Returns:
         Of several the one whose moves come first in
-        :data:`~proposer_rl.tasks.mazes.paths.MOVES`; None
-        where there is no path.
+        :data:`~proposer_rl.tasks.mazes.levels.MOVES`; None where there is no path.
     """
     width = level.walls.shape[1]
     start, goal = (int(cell_index(cell, width)) for cell in (level.start, level.goal))

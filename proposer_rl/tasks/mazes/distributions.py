@@ -8,10 +8,8 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.mazes.generation import generate_levels
-from proposer_rl.tasks.mazes.levels import Level, LevelSpec
-from proposer_rl.tasks.mazes.mechanisms import Generators
-from proposer_rl.tasks.mazes.paths import shortest_path_length
+from proposer_rl.tasks.mazes.generation import Generators, generate_levels
+from proposer_rl.tasks.mazes.levels import Level, LevelSpec, shortest_path_length
 
 
 class LevelDistribution:

@@ -16,15 +16,18 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.functional import pad
 
-from proposer_rl.tasks.mazes.levels import Level, cell_index, cell_plane, cell_position
-from proposer_rl.tasks.mazes.maze_env import MazeEnv
-from proposer_rl.tasks.mazes.paths import (
+from proposer_rl.tasks.mazes.levels import (
     MOVES,
+    Level,
+    cell_index,
+    cell_plane,
+    cell_position,
     cells_first,
     padded_index,
     shortest_path_length,
     successors,
 )
+from proposer_rl.tasks.mazes.maze_env import MazeEnv
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,7 @@ from proposer_rl.models import ActorCritic, MapEncoder
 from proposer_rl.task import Board, ComputeContext, LevelResult, Task, check_distributions, named
 from proposer_rl.tasks.mazes.generation import edit_levels
 from proposer_rl.tasks.mazes.level_files import check_size, shipped_levels, shipped_sets
-from proposer_rl.tasks.mazes.levels import Level
-from proposer_rl.tasks.mazes.paths import shortest_path_length
+from proposer_rl.tasks.mazes.levels import Level, shortest_path_length
 from proposer_rl.tasks.mazes.rendering import level_records
 
 STEPS_PER_SHORTEST = 2  # of a named level: steps allowed for each one of its shortest way

@@ -14,8 +14,15 @@ from torchrl.envs import EnvBase
 
 from proposer_rl.models import own_state, population
 from proposer_rl.settings import signed
-from proposer_rl.tasks.mazes.levels import Level, cell_index, cell_plane, cell_position, planes
-from proposer_rl.tasks.mazes.paths import MOVES, successors
+from proposer_rl.tasks.mazes.levels import (
+    MOVES,
+    Level,
+    cell_index,
+    cell_plane,
+    cell_position,
+    planes,
+    successors,
+)
 from proposer_rl.tasks.mazes.rendering import draw_level
 
 END_KEYS = ("done", "terminated", "truncated")

@@ -26,7 +26,7 @@ from proposer_rl.tasks.mazes.evaluation import (
 )
 from proposer_rl.tasks.mazes.grid_task import GridTask
 from proposer_rl.tasks.mazes.level_files import RECORD, SUFFIXES, read_levels
-from proposer_rl.tasks.mazes.levels import Level, planes
+from proposer_rl.tasks.mazes.levels import Level, planes, shortest_path_length
 from proposer_rl.tasks.mazes.maze_env import MazeEnv
 from proposer_rl.tasks.mazes.maze_settings import (
     ACTIONS,
@@ -42,7 +42,6 @@ from proposer_rl.tasks.mazes.maze_settings import (
     faster_precision,
     unet,
 )
-from proposer_rl.tasks.mazes.paths import shortest_path_length
 from proposer_rl.tasks.mazes.rendering import EPISODE, draw_level
 
 WORST = 0.1  # of the levels, in <name>_success_worst10

@@ -11,8 +11,15 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import CellKind
 from proposer_rl.tasks.mazes.board import Drawings
 from proposer_rl.tasks.mazes.grid_task import GridTask
-from proposer_rl.tasks.mazes.levels import FREE, GOAL, WALL, cell_index
-from proposer_rl.tasks.mazes.paths import MOVES, shortest_way, successors
+from proposer_rl.tasks.mazes.levels import (
+    FREE,
+    GOAL,
+    MOVES,
+    WALL,
+    cell_index,
+    shortest_way,
+    successors,
+)
 from proposer_rl.tasks.view_mazes.view_env import PENALTY, fewest_actions, walks
 from proposer_rl.tasks.view_mazes.view_levels import AGENTS, AHEAD, ViewLevel
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 import scipy
 import torch
+from annotated_types import Ge, Le, Len
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning import SolverSettings, mean_performance
-from proposer_rl.models import ActorCritic, MemoryNetwork, Population, memory_actor_critic
+from proposer_rl.models import ActorCritic, MemoryNetwork
+from proposer_rl.settings import settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, LevelResult, for_copies
 from proposer_rl.tasks.mazes.grid_task import GridTask
@@ -21,27 +24,131 @@ from proposer_rl.tasks.mazes.levels import planes
 from proposer_rl.tasks.mazes.maze_settings import Channels
 from proposer_rl.tasks.mazes.rendering import draw_level
 from proposer_rl.tasks.view_mazes.board import ViewBoard
-from proposer_rl.tasks.view_mazes.view_distributions import ViewDistribution, ViewSpace
+from proposer_rl.tasks.view_mazes.view_distributions import (
+    ViewDistribution,
+    ViewDistributionSettings,
+    ViewSpace,
+    ViewSpaceSettings,
+)
 from proposer_rl.tasks.view_mazes.view_env import (
+    FORWARD,
+    VIEW,
     ViewMazeEnv,
     fewest_actions,
     optimal_view_return,
     visits,
     walks,
 )
-from proposer_rl.tasks.view_mazes.view_levels import VIEW_SUFFIXES, ViewLevel, read_view_levels
-from proposer_rl.tasks.view_mazes.view_settings import (
-    VIEW_ENTRIES,
-    ViewDistributionSettings,
-    ViewEvaluationSettings,
-    ViewMazeSettings,
-    ViewNetworkSettings,
-    ViewSpaceSettings,
-    view_network,
+from proposer_rl.tasks.view_mazes.view_levels import (
+    AHEAD,
+    GOAL_OBJECT,
+    VIEW_SUFFIXES,
+    WALL_OBJECT,
+    ViewLevel,
+    read_view_levels,
 )
 
 LOCATING = 4096  # levels by which the target is located among the bins
 EPISODES_AT_ONCE = 4096  # that are played together on named levels
+
+
+@settings
+class ViewMazeSettings:
+    """The inner environment.
+
+    Attributes:
+        height, width: the grid inside of its border, in cells.
+        max_steps: steps after which an episode is truncated.
+    """
+
+    height: Annotated[int, Ge(2), Le(100)] = 13
+    width: Annotated[int, Ge(2), Le(100)] = 13
+    max_steps: Annotated[int, Ge(1)] = 250
+
+
+@settings
+class ViewNetworkSettings:
+    """The Solver's network.
+
+    Attributes:
+        channels: of the convolution.
+        direction: features of the direction.
+        memory: width of the LSTM.
+        head: width of the hidden layer of actor and critic.
+    """
+
+    channels: Annotated[int, Ge(1)] = 16
+    direction: Annotated[int, Ge(1)] = 5
+    memory: Annotated[int, Ge(1)] = 256
+    head: Annotated[int, Ge(1)] = 32
+
+
+@settings
+class ViewEvaluationSettings:
+    """How the Solver is measured, apart from its training; always by playing.
+
+    Attributes:
+        distributions: names of the distributions that are measured on.
+        levels: number of levels of each distribution, the same in every run.
+        seed: from which they and the actions' random numbers are drawn.
+        episodes: on each level.
+        named_episodes: on each level of a named set (``bin/eval``).
+    """
+
+    distributions: Annotated[list[str], Len(1)]
+    levels: Annotated[int, Ge(1)] = 256
+    seed: Annotated[int, Ge(0)] = 0
+    episodes: Annotated[int, Ge(1)] = 1
+    named_episodes: Annotated[int, Ge(1)] = 100
+
+
+VIEW_ENTRIES = ("view", "direction")
+VIEW_ACTIONS = FORWARD + 1
+SCALE = 10  # that the field divides MiniGrid's numbers by
+GREY_COLOUR, GREEN_COLOUR = 5, 1  # MiniGrid's colours of walls and goal
+
+
+class ViewEncoder(nn.Module):
+    """Features of views and directions.
+
+    The convolution sees MiniGrid's numbers of objects and of their colours, a tenth of them, as in
+    the field. The third number, a door's state, is zero everywhere and left out.
+
+    Args:
+        channels: of the convolution.
+        direction: features of the direction.
+
+    Attributes:
+        features: number of features.
+    """
+
+    def __init__(self, channels: int = 16, direction: int = 5) -> None:
+        super().__init__()
+        self.convolution = nn.Conv2d(2, channels, 3)
+        self.direction = nn.Embedding(len(AHEAD), direction)
+        nn.init.orthogonal_(self.direction.weight, 2**0.5)
+        self.features = channels * (VIEW - 2) ** 2 + direction
+
+    def codes(self, view: Tensor, direction: Tensor) -> Tensor:
+        """Returns codes int64 [N], equal where both views and directions are equal."""
+        digits = ((view & WALL_OBJECT) >> 1) | ((view & GOAL_OBJECT) >> 2)
+        base = 4 ** torch.arange(VIEW**2, device=view.device)
+        return (digits.flatten(1) * base).sum(1) * len(AHEAD) + direction
+
+    def forward(self, view: Tensor, direction: Tensor) -> Tensor:
+        """Returns features [N, F] of views uint8 [N, 5, 5] and directions int64 [N]."""
+        colour = (view == WALL_OBJECT) * GREY_COLOUR + (view == GOAL_OBJECT) * GREEN_COLOUR
+        image = torch.stack([view, colour], 1) / SCALE
+        seen = torch.relu(self.convolution(image)).flatten(1)
+        return torch.cat([seen, self.direction(direction)], 1)
+
+
+def view_network(settings: ViewNetworkSettings) -> MemoryNetwork:
+    """Returns the network of one Solver."""
+    encoder = ViewEncoder(settings.channels, settings.direction)
+    return MemoryNetwork(
+        encoder, encoder.features, VIEW_ACTIONS, memory=settings.memory, head=settings.head
+    )
 
 
 class ViewMazeTask(GridTask):
@@ -66,6 +173,7 @@ class ViewMazeTask(GridTask):
     steps_name = "fewest_actions"
     replayed = ("rollouts",)
     drop_finished = True
+    observed = VIEW_ENTRIES
     counting = ", turns included"
     text_key = "> v < ^ start and direction, G goal, • the Solver's episode"
 
@@ -82,7 +190,7 @@ class ViewMazeTask(GridTask):
         solver: SolverSettings,
         context: ComputeContext,
     ) -> None:
-        self._network = network
+        self._network, self.memory = network, network.memory
         self._named_episodes = evaluation.named_episodes
         self._draws = Streams(evaluation.seed, "scores")  # of named levels
         super().__init__(
@@ -122,10 +230,6 @@ class ViewMazeTask(GridTask):
     def network(self) -> MemoryNetwork:
         """Returns the network of one Solver."""
         return view_network(self._network)
-
-    def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
-        """Returns K networks with memory."""
-        return memory_actor_critic(population, VIEW_ENTRIES, self._network.memory)
 
     def optimal_return(self, levels: ViewLevel) -> Tensor:
         """Returns the largest expected return of any policy on levels [*B]: float [*B]."""

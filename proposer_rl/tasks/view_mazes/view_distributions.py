@@ -8,23 +8,64 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from itertools import product
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge, Len
 from torch import Tensor
 
+from proposer_rl.settings import BY_KIND, settings
 from proposer_rl.tasks.mazes.generation import generate_levels
-from proposer_rl.tasks.mazes.levels import cell_position
-from proposer_rl.tasks.mazes.paths import shortest_path_length
+from proposer_rl.tasks.mazes.levels import cell_position, shortest_path_length
 from proposer_rl.tasks.view_mazes.view_levels import AHEAD, ViewLevel, directed
-from proposer_rl.tasks.view_mazes.view_settings import (
-    PerfectSettings,
-    RoomsSettings,
-    ScatteredSettings,
-    ViewDistributionSettings,
-    ViewSpaceSettings,
-)
 
 ENDPOINTS = 2  # cells that are no walls: start and goal
+Walls = Annotated[int, Ge(0)]
+
+
+@settings
+class ScatteredSettings:
+    """Walls anywhere; each number of them from ``fewest`` to ``most`` is equally likely.
+
+    Attributes:
+        solvable: whether levels are drawn again whose goal cannot be reached.
+    """
+
+    kind: Literal["scattered"] = "scattered"
+    fewest: Walls = 0
+    most: Walls = 60
+    solvable: bool = False
+
+
+@settings
+class PerfectSettings:
+    """Mazes with one way between any two cells."""
+
+    kind: Literal["perfect"] = "perfect"
+
+
+@settings
+class RoomsSettings:
+    """Four rooms with a door between any two neighbours."""
+
+    kind: Literal["four_rooms"] = "four_rooms"
+
+
+ViewDistributionSettings = Annotated[ScatteredSettings | PerfectSettings | RoomsSettings, BY_KIND]
+
+
+@settings
+class ViewSpaceSettings:
+    """The Proposer's bins.
+
+    Attributes:
+        walls: numbers of walls.
+        path_lengths: moves on the shortest path, each with each of the numbers; None for start and
+            goal anywhere, as in the field.
+    """
+
+    walls: Annotated[list[Walls], Len(1)]
+    path_lengths: Annotated[list[Annotated[int, Ge(1)]], Len(1)] | None = None
 
 
 class ViewDistribution:

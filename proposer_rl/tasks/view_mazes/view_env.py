@@ -13,9 +13,8 @@ from torchrl.data import Binary, Bounded, Categorical
 from proposer_rl.learning import play_episodes
 from proposer_rl.models import ActorCritic, own_state
 from proposer_rl.settings import signed
-from proposer_rl.tasks.mazes.levels import cell_index, cell_plane
+from proposer_rl.tasks.mazes.levels import STEPS_BETWEEN_CHECKS, cell_index, cell_plane
 from proposer_rl.tasks.mazes.maze_env import LevelEnv
-from proposer_rl.tasks.mazes.paths import STEPS_BETWEEN_CHECKS
 from proposer_rl.tasks.view_mazes.view_levels import (
     AHEAD,
     EMPTY_OBJECT,

@@ -18,7 +18,7 @@ from proposer_rl.tasks.mazes import (
     shortest_path_length,
     validate_levels,
 )
-from proposer_rl.tasks.mazes.mechanisms import _open_cells
+from proposer_rl.tasks.mazes.generation import _open_cells
 from tests.draws import generators, seeded
 from tests.tasks.mazes.oracles import distances, path_length
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from proposer_rl.tasks.mazes import Level, shortest_path_length
-from proposer_rl.tasks.mazes.paths import cells_at_depth, cells_first
+from proposer_rl.tasks.mazes.levels import cells_at_depth, cells_first
 from tests.tasks.mazes.oracles import distances, path_length, random_levels
 
 

@@ -12,10 +12,9 @@ from torch import Tensor
 from proposer_rl.learning import RolloutPolicy
 from proposer_rl.models import ActorCritic, categorical
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.view_mazes.task import ViewMazeTask
+from proposer_rl.tasks.view_mazes.task import ViewEvaluationSettings, ViewMazeSettings, ViewMazeTask
 from proposer_rl.tasks.view_mazes.view_env import FORWARD, ViewMazeEnv, optimal_view_return, visits
 from proposer_rl.tasks.view_mazes.view_levels import ViewLevel
-from proposer_rl.tasks.view_mazes.view_settings import ViewEvaluationSettings, ViewMazeSettings
 from tests.tasks.view_mazes.oracles import random_levels
 from tests.tiny import tiny_view_task
 

@@ -12,11 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from proposer_rl.tasks.mazes.levels import validate_levels
-from proposer_rl.tasks.mazes.paths import shortest_path_length
+from proposer_rl.tasks.mazes.levels import shortest_path_length, validate_levels
 from proposer_rl.tasks.view_mazes.view_distributions import (
+    PerfectSettings,
+    RoomsSettings,
+    ScatteredSettings,
     ViewDistribution,
+    ViewDistributionSettings,
     ViewSpace,
+    ViewSpaceSettings,
     four_rooms,
     perfect_mazes,
     scattered_walls,
@@ -24,13 +28,6 @@ from proposer_rl.tasks.view_mazes.view_distributions import (
 )
 from proposer_rl.tasks.view_mazes.view_env import fewest_actions, optimal_view_return
 from proposer_rl.tasks.view_mazes.view_levels import AHEAD, ViewLevel
-from proposer_rl.tasks.view_mazes.view_settings import (
-    PerfectSettings,
-    RoomsSettings,
-    ScatteredSettings,
-    ViewDistributionSettings,
-    ViewSpaceSettings,
-)
 from tests.tasks.view_mazes.oracles import random_levels
 
 CPU = torch.device("cpu")
