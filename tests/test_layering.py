@@ -26,7 +26,7 @@ SHOWING = ("report", "play")
 SHOW = {"cli.report", "cli.watch", "cli.play", "cli.evaluate", "cli.shown"}
 TRAINING = ("cli.run", "cli.build", "methods", "experiment.loop", "teaching")
 # The names of the package itself, the rooms that know mazes, and an environment with its own walls.
-KNOW_MAZES = ("tasks.mazes", "tasks.view_mazes", "tasks.arena.goal_maze", "api")
+KNOW_MAZES = ("tasks.mazes", "tasks.view_mazes", "tasks.arena.planes", "api")
 MOST_ROOMS = 17
 
 

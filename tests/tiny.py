@@ -32,17 +32,13 @@ from proposer_rl.tasks.mazes.maze_settings import (
 from proposer_rl.tasks.mazes.task import MazeTask
 from proposer_rl.tasks.point_masses.task import GateSettings, PointMassTask
 from proposer_rl.tasks.ranges import RangeSettings
-from proposer_rl.tasks.view_mazes.task import (
-    ViewEvaluationSettings,
-    ViewMazeSettings,
-    ViewMazeTask,
-    ViewNetworkSettings,
-)
+from proposer_rl.tasks.view_mazes.task import ViewEvaluationSettings, ViewMazeSettings, ViewMazeTask
 from proposer_rl.tasks.view_mazes.view_distributions import (
     PerfectSettings,
     ScatteredSettings,
     ViewSpaceSettings,
 )
+from proposer_rl.tasks.view_mazes.view_env import ViewNetworkSettings
 
 EXAMPLES = str(Path(__file__).parents[1] / "examples")
 EVALUATE = ExactEvaluator(max_steps=8)

@@ -15,8 +15,12 @@ from proposer_rl.learning import PPO, PPOSettings
 from proposer_rl.learning.rollout import set_values
 from proposer_rl.meta.first_order import surrogate
 from proposer_rl.models import Population, memory_actor_critic
-from proposer_rl.tasks.view_mazes.task import VIEW_ENTRIES, ViewNetworkSettings, view_network
-from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv
+from proposer_rl.tasks.view_mazes.view_env import (
+    VIEW_ENTRIES,
+    ViewMazeEnv,
+    ViewNetworkSettings,
+    view_network,
+)
 from tests.draws import generators
 from tests.tasks.view_mazes.oracles import random_levels
 

@@ -11,7 +11,7 @@ import scipy
 import torch
 from annotated_types import Ge, Le, Len
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning import SolverSettings, mean_performance
@@ -31,22 +31,16 @@ from proposer_rl.tasks.view_mazes.view_distributions import (
     ViewSpaceSettings,
 )
 from proposer_rl.tasks.view_mazes.view_env import (
-    FORWARD,
-    VIEW,
+    VIEW_ENTRIES,
     ViewMazeEnv,
+    ViewNetworkSettings,
     fewest_actions,
     optimal_view_return,
+    view_network,
     visits,
     walks,
 )
-from proposer_rl.tasks.view_mazes.view_levels import (
-    AHEAD,
-    GOAL_OBJECT,
-    VIEW_SUFFIXES,
-    WALL_OBJECT,
-    ViewLevel,
-    read_view_levels,
-)
+from proposer_rl.tasks.view_mazes.view_levels import VIEW_SUFFIXES, ViewLevel, read_view_levels
 
 LOCATING = 4096  # levels by which the target is located among the bins
 EPISODES_AT_ONCE = 4096  # that are played together on named levels
@@ -67,23 +61,6 @@ class ViewMazeSettings:
 
 
 @settings
-class ViewNetworkSettings:
-    """The Solver's network.
-
-    Attributes:
-        channels: of the convolution.
-        direction: features of the direction.
-        memory: width of the LSTM.
-        head: width of the hidden layer of actor and critic.
-    """
-
-    channels: Annotated[int, Ge(1)] = 16
-    direction: Annotated[int, Ge(1)] = 5
-    memory: Annotated[int, Ge(1)] = 256
-    head: Annotated[int, Ge(1)] = 32
-
-
-@settings
 class ViewEvaluationSettings:
     """How the Solver is measured, apart from its training; always by playing.
 
@@ -100,55 +77,6 @@ class ViewEvaluationSettings:
     seed: Annotated[int, Ge(0)] = 0
     episodes: Annotated[int, Ge(1)] = 1
     named_episodes: Annotated[int, Ge(1)] = 100
-
-
-VIEW_ENTRIES = ("view", "direction")
-VIEW_ACTIONS = FORWARD + 1
-SCALE = 10  # that the field divides MiniGrid's numbers by
-GREY_COLOUR, GREEN_COLOUR = 5, 1  # MiniGrid's colours of walls and goal
-
-
-class ViewEncoder(nn.Module):
-    """Features of views and directions.
-
-    The convolution sees MiniGrid's numbers of objects and of their colours, a tenth of them, as in
-    the field. The third number, a door's state, is zero everywhere and left out.
-
-    Args:
-        channels: of the convolution.
-        direction: features of the direction.
-
-    Attributes:
-        features: number of features.
-    """
-
-    def __init__(self, channels: int = 16, direction: int = 5) -> None:
-        super().__init__()
-        self.convolution = nn.Conv2d(2, channels, 3)
-        self.direction = nn.Embedding(len(AHEAD), direction)
-        nn.init.orthogonal_(self.direction.weight, 2**0.5)
-        self.features = channels * (VIEW - 2) ** 2 + direction
-
-    def codes(self, view: Tensor, direction: Tensor) -> Tensor:
-        """Returns codes int64 [N], equal where both views and directions are equal."""
-        digits = ((view & WALL_OBJECT) >> 1) | ((view & GOAL_OBJECT) >> 2)
-        base = 4 ** torch.arange(VIEW**2, device=view.device)
-        return (digits.flatten(1) * base).sum(1) * len(AHEAD) + direction
-
-    def forward(self, view: Tensor, direction: Tensor) -> Tensor:
-        """Returns features [N, F] of views uint8 [N, 5, 5] and directions int64 [N]."""
-        colour = (view == WALL_OBJECT) * GREY_COLOUR + (view == GOAL_OBJECT) * GREEN_COLOUR
-        image = torch.stack([view, colour], 1) / SCALE
-        seen = torch.relu(self.convolution(image)).flatten(1)
-        return torch.cat([seen, self.direction(direction)], 1)
-
-
-def view_network(settings: ViewNetworkSettings) -> MemoryNetwork:
-    """Returns the network of one Solver."""
-    encoder = ViewEncoder(settings.channels, settings.direction)
-    return MemoryNetwork(
-        encoder, encoder.features, VIEW_ACTIONS, memory=settings.memory, head=settings.head
-    )
 
 
 class ViewMazeTask(GridTask):

@@ -1,18 +1,20 @@
-"""The partially observable maze in TorchRL, the fewest actions there, and where Solvers walk."""
+"""The partially observable maze in TorchRL, a network that sees it, and where Solvers walk."""
 
 from __future__ import annotations
 
 from functools import cache
+from typing import Annotated
 
 import torch
+from annotated_types import Ge
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import pad
 from torchrl.data import Binary, Bounded, Categorical
 
 from proposer_rl.learning import play_episodes
-from proposer_rl.models import ActorCritic, own_state
-from proposer_rl.settings import signed
+from proposer_rl.models import ActorCritic, MemoryNetwork, own_state
+from proposer_rl.settings import settings, signed
 from proposer_rl.tasks.mazes.levels import STEPS_BETWEEN_CHECKS, cell_index, cell_plane
 from proposer_rl.tasks.mazes.maze_env import LevelEnv
 from proposer_rl.tasks.view_mazes.view_levels import (
@@ -23,7 +25,8 @@ from proposer_rl.tasks.view_mazes.view_levels import (
     ViewLevel,
 )
 
-LEFT, RIGHT, FORWARD = range(3)
+VIEW_ACTIONS = 3
+LEFT, RIGHT, FORWARD = range(VIEW_ACTIONS)
 
 VIEW = 5  # cells on a side of what is seen
 RIM = VIEW - 1  # of walls around the grid, so that all that is seen is in memory
@@ -71,7 +74,7 @@ class ViewMazeEnv(LevelEnv):
         super().__init__(levels, max_steps)
         batch = self.batch_size
         self._specify(
-            actions=FORWARD + 1,
+            actions=VIEW_ACTIONS,
             view=Bounded(EMPTY_OBJECT, GOAL_OBJECT, (*batch, VIEW, VIEW), dtype=torch.uint8),
             direction=Categorical(len(AHEAD), shape=batch),
             is_init=Binary(1, (*batch, 1), dtype=torch.bool),
@@ -166,6 +169,71 @@ def _directions(width: int, device: torch.device) -> tuple[Tensor, Tensor, Tenso
     # int32: half the memory to go through.
     seen = cell_index(seen, width).flatten(1).int()
     return meaning.to(device), changes.to(device), seen.to(device)
+
+
+@settings
+class ViewNetworkSettings:
+    """The Solver's network.
+
+    Attributes:
+        channels: of the convolution.
+        direction: features of the direction.
+        memory: width of the LSTM.
+        head: width of the hidden layer of actor and critic.
+    """
+
+    channels: Annotated[int, Ge(1)] = 16
+    direction: Annotated[int, Ge(1)] = 5
+    memory: Annotated[int, Ge(1)] = 256
+    head: Annotated[int, Ge(1)] = 32
+
+
+VIEW_ENTRIES = ("view", "direction")
+SCALE = 10  # that the field divides MiniGrid's numbers by
+GREY_COLOUR, GREEN_COLOUR = 5, 1  # MiniGrid's colours of walls and goal
+
+
+class ViewEncoder(nn.Module):
+    """Features of views and directions.
+
+    The convolution sees MiniGrid's numbers of objects and of their colours, a tenth of them, as in
+    the field. The third number, a door's state, is zero everywhere and left out.
+
+    Args:
+        channels: of the convolution.
+        direction: features of the direction.
+
+    Attributes:
+        features: number of features.
+    """
+
+    def __init__(self, channels: int = 16, direction: int = 5) -> None:
+        super().__init__()
+        self.convolution = nn.Conv2d(2, channels, 3)
+        self.direction = nn.Embedding(len(AHEAD), direction)
+        nn.init.orthogonal_(self.direction.weight, 2**0.5)
+        self.features = channels * (VIEW - 2) ** 2 + direction
+
+    def codes(self, view: Tensor, direction: Tensor) -> Tensor:
+        """Returns codes int64 [N], equal where both views and directions are equal."""
+        digits = ((view & WALL_OBJECT) >> 1) | ((view & GOAL_OBJECT) >> 2)
+        base = 4 ** torch.arange(VIEW**2, device=view.device)
+        return (digits.flatten(1) * base).sum(1) * len(AHEAD) + direction
+
+    def forward(self, view: Tensor, direction: Tensor) -> Tensor:
+        """Returns features [N, F] of views uint8 [N, 5, 5] and directions int64 [N]."""
+        colour = (view == WALL_OBJECT) * GREY_COLOUR + (view == GOAL_OBJECT) * GREEN_COLOUR
+        image = torch.stack([view, colour], 1) / SCALE
+        seen = torch.relu(self.convolution(image)).flatten(1)
+        return torch.cat([seen, self.direction(direction)], 1)
+
+
+def view_network(settings: ViewNetworkSettings) -> MemoryNetwork:
+    """Returns the network of one Solver."""
+    encoder = ViewEncoder(settings.channels, settings.direction)
+    return MemoryNetwork(
+        encoder, encoder.features, VIEW_ACTIONS, memory=settings.memory, head=settings.head
+    )
 
 
 def fewest_actions(levels: ViewLevel) -> Tensor:

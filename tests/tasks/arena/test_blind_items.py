@@ -10,7 +10,7 @@ import yaml
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
-from proposer_rl.tasks.arena.blind_items import ITEMS, SYMBOLS, BlindItemsEnv
+from proposer_rl.tasks.arena.items import ITEMS, SYMBOLS, BlindItemsEnv
 from tests.tasks.arena.first_ends import played
 
 ALL = TensorDict({"item": torch.arange(ITEMS)}, [ITEMS])

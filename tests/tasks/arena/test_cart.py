@@ -7,7 +7,7 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from proposer_rl.tasks.arena.cart import CartEnv
+from proposer_rl.tasks.arena.control import CartEnv
 from tests.tasks.arena.first_ends import levels, played
 
 USUAL = {

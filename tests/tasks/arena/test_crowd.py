@@ -8,7 +8,7 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from proposer_rl.tasks.arena.crowd import CrowdEnv
+from proposer_rl.tasks.arena.ways import CrowdEnv
 from proposer_rl.tasks.batched_envs.env import uniform
 from tests.tasks.arena.first_ends import levels, played
 

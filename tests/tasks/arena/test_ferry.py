@@ -6,7 +6,7 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from proposer_rl.tasks.arena.ferry import FerryEnv
+from proposer_rl.tasks.arena.ways import FerryEnv
 from tests.tasks.arena.first_ends import levels, played
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from proposer_rl.tasks.arena.fork import ForkEnv
+from proposer_rl.tasks.arena.ways import ForkEnv
 from tests.tasks.arena.episodes import levels, play
 
 BOTH = levels(depth=[0.1, 0.96, 0.98, 1.0], length=[6, 2, 6, 2])

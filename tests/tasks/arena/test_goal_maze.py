@@ -8,7 +8,7 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from proposer_rl.tasks.arena.goal_maze import GoalMazeEnv
+from proposer_rl.tasks.arena.planes import GoalMazeEnv
 from tests.tasks.arena.first_ends import levels, played
 
 WAY = [(-6.0, 6.0), (6.0, 6.0), (6.0, -6.0)]  # corners of the corridor, clockwise

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
-from proposer_rl.tasks.arena.hill import HillEnv
+from proposer_rl.tasks.arena.control import HillEnv
 
 
 def cars(*forces: float) -> TensorDict:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 
-from proposer_rl.tasks.arena.ice import IceEnv
+from proposer_rl.tasks.arena.ways import IceEnv
 from tests.tasks.arena.episodes import levels, play
 
 EPISODES, STEPS = 4000, 40

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torchrl.envs import check_env_specs
 
-from proposer_rl.tasks.arena.lure import LureEnv
+from proposer_rl.tasks.arena.planes import LureEnv
 from tests.tasks.arena.first_ends import levels, played
 
 TRAP = {"depth": 1.2, "distance": 4.0, "width": 1.2}

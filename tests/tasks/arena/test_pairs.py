@@ -6,7 +6,7 @@ import torch
 
 from proposer_rl.cli.build import make_task
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.arena.pairs import ITEMS, PairsEnv
+from proposer_rl.tasks.arena.items import ITEMS, PairsEnv
 from tests.tasks.arena.episodes import levels, play
 from tests.tiny import composed
 

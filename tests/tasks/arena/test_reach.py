@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from proposer_rl.tasks.arena.reach import ReachEnv
+from proposer_rl.tasks.arena.planes import ReachEnv
 from tests.tasks.arena.episodes import levels, play
 
 CORNERS = levels(distance=[0.5, 4.0, 4.0, 4.0], direction=[-1.0, -0.4, 0.3, 1.0])

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from proposer_rl.tasks.arena.recall import RecallEnv
+from proposer_rl.tasks.arena.ways import RecallEnv
 from tests.tasks.arena.first_ends import levels, played
 
 

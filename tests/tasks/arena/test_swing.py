@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 
-from proposer_rl.tasks.arena.swing import SwingEnv
+from proposer_rl.tasks.arena.control import SwingEnv
 from tests.tasks.arena.episodes import levels, play
 
 EASY = {"mass": [1.0], "length": [1.0], "torque": [8.0], "seed": [3]}

@@ -1,4 +1,4 @@
-"""Two hundred problems in an order that says nothing about them."""
+"""Two hundred problems each, in an order that says nothing about them: words, and goals."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from proposer_rl.tasks.arena.planes import FAR, ReachEnv, goal
 from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values, uniform
 
 ITEMS, SYMBOLS, ANSWERS, LONGEST = 200, 24, 4, 17
@@ -48,3 +49,33 @@ class BlindItemsEnv(BatchedEnv):
     def _symbol(state: Tensor, level: Values) -> Tensor:
         place = state.squeeze(-1).long().clamp(max=LONGEST - 1)
         return _ASKED.to(state.device)[level["item"].long(), place]
+
+
+NUMBERS = uniform(torch.full((ITEMS, 1), 7), torch.arange(ITEMS).unsqueeze(-1), 4)  # of each item
+NEAREST = 0.4
+
+
+class PairsEnv(ReachEnv):
+    """A point that is pushed to the goal of the level's ``item``, whose number tells nothing."""
+
+    @classmethod
+    def features(cls, level: Values) -> Tensor:
+        """Returns distance, goal and two numbers without a meaning, float [*B, 5], -1 to 1."""
+        place = problem(level)
+        far = 2 * place["distance"].unsqueeze(-1) / FAR - 1
+        idle = 2 * NUMBERS.to(far.device)[level["item"]][..., 2:] - 1
+        return torch.cat([far, goal(place) / FAR, idle], -1)
+
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
+        """Returns the point's next place and velocity."""
+        return super().advance(state, action, problem(level), chance)
+
+    def observe(self, state: Tensor, level: Values) -> Tensor:
+        """Returns what is seen of the item's goal."""
+        return super().observe(state, problem(level))
+
+
+def problem(level: Values) -> dict[str, Tensor]:
+    """Returns the distance and direction of items int64 [*B], each float [*B]."""
+    near, turn = NUMBERS.to(level["item"].device)[level["item"]][..., :2].unbind(-1)
+    return {"distance": NEAREST + (FAR - NEAREST) * near, "direction": 2 * turn - 1}
