@@ -23,19 +23,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules import set_recurrent_mode
 
-from proposer_rl.learning import graphs
-from proposer_rl.learning.objective import (
-    ACTED_VALUE,
-    CopiesClipLoss,
-    MakeLoss,
-    PPOSettings,
-    clip_gradients_,
-    explained_variance,
-    gae,
-    make_loss,
-    of_copies,
-    require_finite,
-)
+from proposer_rl.learning import graphs, objective
+from proposer_rl.learning.objective import MakeLoss, PPOSettings
 from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_values
 from proposer_rl.learning.snapshot import (
     complete_adam,
@@ -113,9 +102,11 @@ class PPO:
         )
         self._minibatches = Minibatches(agent, env.batch_size, settings)
         self.statistics = Statistics(env, agent, settings)
-        self._advantage = advantage or gae(settings.gamma, settings.lmbda, agent.value_key)
+        self._advantage = advantage or objective.gae(
+            settings.gamma, settings.lmbda, agent.value_key
+        )
         clipped = partial(
-            CopiesClipLoss,
+            objective.CopiesClipLoss,
             copies=agent.copies,
             clip_epsilon=settings.clip_epsilon,
             entropy_coeff=settings.entropy_coeff,
@@ -123,7 +114,7 @@ class PPO:
             normalize_advantage=settings.normalize_advantage and self._minibatches.steps > 1,
             clip_value=settings.clip_value,
         )
-        self._loss = make_loss(loss or clipped, agent)
+        self._loss = objective.make_loss(loss or clipped, agent)
         annealed = settings.anneal_updates is not None and hasattr(self._loss, "clip_epsilon")
         if settings.anneal_clip and not annealed:
             raise ArgumentError("anneal_clip=True: needs anneal_updates, and PPO's own loss")
@@ -219,7 +210,7 @@ class PPO:
                 set_values(self.agent, steps, level)
             self._advantage(steps)
             if self.settings.clip_value is not None:
-                steps.set(ACTED_VALUE, steps[value])
+                steps.set(objective.ACTED_VALUE, steps[value])
             for epoch in range(self.settings.epochs):
                 order = batch.get(f"order_{update}_{epoch}", None)
                 parts = self._minibatches(steps, level, order)
@@ -232,7 +223,7 @@ class PPO:
             loss, metrics = self._forward(steps, level)
         self._adam.zero_grad()
         loss.backward()  # each replica's gradient is its own
-        norm = clip_gradients_(self._parameters, self.settings.max_grad_norm, self.copies)
+        norm = objective.clip_gradients_(self._parameters, self.settings.max_grad_norm, self.copies)
         self._adam.step()
         return TensorDict({**metrics, "grad_norm": norm}, norm.shape)
 
@@ -244,12 +235,12 @@ class PPO:
         steps = self.statistics.in_units(agent.decode(steps.copy(), agent.encode(level)))
         losses = self._loss(steps)
         metrics = {
-            key: of_copies(losses[key], copies)
+            key: objective.of_copies(losses[key], copies)
             for key in losses.keys()
             if key.startswith("loss_") or key in DIAGNOSTICS
         }
         terms = [metric for key, metric in metrics.items() if key.startswith("loss_")]
-        metrics["explained_variance"] = explained_variance(steps, agent.value_key, copies)
+        metrics["explained_variance"] = objective.explained_variance(steps, agent.value_key, copies)
         return torch.stack(terms).sum(), {key: metric.detach() for key, metric in metrics.items()}
 
     def complete(self, rollout: TensorDictBase) -> TensorDictBase:
@@ -300,7 +291,7 @@ class PPO:
             DivergedError: if a reward, loss, gradient or weight is not finite, naming the replica.
         """
         weights = dict(self.agent.named_parameters())
-        require_finite(*self._last_training, weights, self.agent.copies, first)
+        objective.require_finite(*self._last_training, weights, self.agent.copies, first)
 
     def snapshot(self) -> TensorDict:
         """Returns a copy of weights and Adam's state, batch [K] with replicas and [] without.

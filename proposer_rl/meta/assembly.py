@@ -14,16 +14,7 @@ from proposer_rl.learning import LearningSettings
 from proposer_rl.meta.actions import Actions, Mixture, ProblemChoices
 from proposer_rl.meta.env import SolverTrainingEnv, SolverView
 from proposer_rl.meta.rewards import Reward
-from proposer_rl.models import (
-    ActorCritic,
-    MixtureHead,
-    ProblemHead,
-    ProposerNetwork,
-    categorical,
-    joint_categorical,
-    normal,
-    proposer_actor_critic,
-)
+from proposer_rl.models import ActorCritic, categorical, joint_categorical, normal, proposer
 from proposer_rl.settings import BY_KIND, settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
@@ -145,17 +136,17 @@ def proposer_agent(task: Task, config: ProposerSettings) -> ActorCritic:
     distribution: Callable[..., Distribution]
     if isinstance(action, MixtureSettings):
         directions = task.space.coordinates.shape[1]
-        head = MixtureHead(width, directions, hidden=hidden, spread=action.spread)
+        head = proposer.MixtureHead(width, directions, hidden=hidden, spread=action.spread)
         distribution = normal
     else:
         size = task.batch_size, task.space.size
-        head = ProblemHead(width, *size, hidden=hidden, bands=action.bands)
+        head = proposer.ProblemHead(width, *size, hidden=hidden, bands=action.bands)
         distribution = joint_categorical if action.ratio == "joint" else categorical
-    network = ProposerNetwork(
+    network = proposer.ProposerNetwork(
         head,
         task.probe_encoder(config.context),
         context=config.context,
         numbers=len(config.observes),
         hidden=hidden,
     ).to(task.device)
-    return proposer_actor_critic(network, distribution, ["probes", *config.observes])
+    return proposer.proposer_actor_critic(network, distribution, ["probes", *config.observes])

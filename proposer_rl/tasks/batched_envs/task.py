@@ -37,7 +37,8 @@ class BatchedTask(Task):
         seeded: whether levels have seeds, which random numbers come from.
 
     Raises:
-        ArgumentError: naming the key, if there is no such class, or for a parameter that is no
+        ArgumentError: naming the key, if there is no such class, its first step reads a parameter
+            that there is not or has other sizes than the class says, or for a parameter that is no
             range.
     """
 
@@ -79,6 +80,20 @@ class BatchedTask(Task):
                 "parameters": {name: asdict(one) for name, one in parameters.items()},
             },
         )
+        self._try(env, list(parameters))
+
+    def _try(self, name: str, parameters: list[str]) -> None:
+        env = self.environment(self.evaluated_on["target"][:1])
+        try:
+            first = env.reset()
+            after = env.step(first.set("action", env.full_action_spec["action"].zero()))["next"]
+        except KeyError as error:
+            raise ArgumentError(f"parameters={parameters}: {name} reads {error}, too") from error
+        sizes = {"observation": self._class.observation_size, "state": self._class.state_size}
+        for key, size in sizes.items():
+            if key in after.keys() and after[key].shape != (1, size):
+                found = list(after[key].shape[1:])
+                raise ArgumentError(f"env={name}: {key}_size={size}, but a step makes {found}")
 
     @property
     def about(self) -> dict[str, str]:

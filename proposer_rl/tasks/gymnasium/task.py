@@ -17,17 +17,9 @@ from gymnasium.vector.utils import CloudpickleWrapper
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torchrl import envs
 from torchrl.data import TensorSpec
-from torchrl.envs import (
-    Compose,
-    EnvBase,
-    FrameSkipTransform,
-    StepCounter,
-    Transform,
-    TransformedEnv,
-    VecNorm,
-    VecNormV2,
-)
+from torchrl.envs import EnvBase, Transform
 
 from proposer_rl.extras import install_command
 from proposer_rl.learning import SolverSettings, in_first_episode
@@ -266,7 +258,9 @@ class GymnasiumTask(Task):
             reward_scale=self.reward_scale,
             **how,
         )
-        return TransformedEnv(env, Compose(*map(_copied, transforms))) if transforms else env
+        return (
+            envs.TransformedEnv(env, envs.Compose(*map(_copied, transforms))) if transforms else env
+        )
 
     def _specs(self, level: TensorDictBase) -> tuple[dict[str, TensorSpec], TensorSpec]:
         """Returns specs of what Solvers see and do after the transforms, and tries the network.
@@ -318,20 +312,20 @@ def _checked_transforms(transforms: Iterable[Any]) -> Iterator[Transform]:
         ValueError: for what is none, keeps running statistics, or mistakes where episodes end.
     """
     for one in transforms:
-        if isinstance(one, Compose):
+        if isinstance(one, envs.Compose):
             yield from _checked_transforms(part.clone() for part in one.transforms)
-        elif isinstance(one, VecNorm | VecNormV2):
+        elif isinstance(one, envs.VecNorm | envs.VecNormV2):
             raise ValueError(
                 f"transforms: {type(one).__name__}: it keeps running statistics, of which training "
                 "and evaluations would have their own. What all environments share is normalised "
                 "by PPO's normalize_observations and normalize_rewards"
             )
-        elif isinstance(one, FrameSkipTransform):
+        elif isinstance(one, envs.FrameSkipTransform):
             raise ValueError(
                 "transforms: FrameSkipTransform: it steps on beyond an episode's end; a wrapper of "
                 "wrappers can take several steps at once"
             )
-        elif isinstance(one, StepCounter) and one.max_steps is not None:
+        elif isinstance(one, envs.StepCounter) and one.max_steps is not None:
             raise ValueError(
                 f"transforms: StepCounter: max_steps={one.max_steps}: the environment would not "
                 "see such an end, nor say whether it is a success; set max_steps of the task"

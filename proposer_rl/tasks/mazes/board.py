@@ -10,19 +10,8 @@ from torch import Tensor
 
 from proposer_rl.models import ActorCritic, cell_maps
 from proposer_rl.task import CellKind
-from proposer_rl.tasks.mazes.evaluation import (
-    ExactEvaluator,
-    expected_visits,
-    policy_path,
-    success_from_cells,
-)
+from proposer_rl.tasks.mazes import evaluation, level_files
 from proposer_rl.tasks.mazes.grid_task import GridTask
-from proposer_rl.tasks.mazes.level_files import (
-    levels_from_text,
-    levels_to_text,
-    shipped_levels,
-    shipped_sets,
-)
 from proposer_rl.tasks.mazes.levels import (
     FREE,
     GOAL,
@@ -52,7 +41,7 @@ class Drawings:
     def __init__(self, task: GridTask) -> None:
         self._task = task
         self.size = task.grid
-        self.sets = shipped_sets()
+        self.sets = level_files.shipped_sets()
 
     def read(self, rows: Sequence[str]) -> Any:
         """The level that is drawn; see :class:`~proposer_rl.task.Board`."""
@@ -70,15 +59,15 @@ class Drawings:
 
     def level_set(self, name: str) -> Mapping[str, Level]:
         """The levels of a shipped set; an agent that turns looks to the right."""
-        return shipped_levels(name, self._task.level)
+        return level_files.shipped_levels(name, self._task.level)
 
     def read_file(self, text: str) -> Mapping[str, Level]:
         """The levels of a file's text; docs/how_to/levels.md has the format."""
-        return levels_from_text(text, kind=self._task.level)
+        return level_files.levels_from_text(text, kind=self._task.level)
 
     def write_file(self, name: str, level: Level) -> str:
         """A file's text; docs/how_to/levels.md has the format."""
-        return levels_to_text({name: level})
+        return level_files.levels_to_text({name: level})
 
 
 class MazeBoard(Drawings):
@@ -112,15 +101,15 @@ class MazeBoard(Drawings):
         if not (logits.isfinite().all() and values.isfinite().all()):
             raise ValueError("the Solver of this checkpoint answers with NaN or infinity")
         policy = logits.softmax(0)
-        visits = expected_visits(level, policy, limit)
-        results = ExactEvaluator(limit, step_penalty)(level, logits)
+        visits = evaluation.expected_visits(level, policy, limit)
+        results = evaluation.ExactEvaluator(limit, step_penalty)(level, logits)
         goal = cell_plane(level.goal, level.walls.shape).bool()
         maps = {
             "critic's value": (values, level.walls | goal),
-            "success from here": (success_from_cells(level, policy, limit), level.walls),
+            "success from here": (evaluation.success_from_cells(level, policy, limit), level.walls),
             "expected visits": (visits, level.walls),
         }
-        path = policy_path(level, logits, limit).tolist()
+        path = evaluation.policy_path(level, logits, limit).tolist()
         return {
             "results": {
                 "success": float(results["success"]),

@@ -23,6 +23,7 @@ from proposer_rl.tasks.mazes.grid_task import GridTask
 from proposer_rl.tasks.mazes.levels import planes
 from proposer_rl.tasks.mazes.maze_settings import Channels
 from proposer_rl.tasks.mazes.rendering import draw_level
+from proposer_rl.tasks.view_mazes import view_env
 from proposer_rl.tasks.view_mazes.board import ViewBoard
 from proposer_rl.tasks.view_mazes.view_distributions import (
     ViewDistribution,
@@ -30,16 +31,7 @@ from proposer_rl.tasks.view_mazes.view_distributions import (
     ViewSpace,
     ViewSpaceSettings,
 )
-from proposer_rl.tasks.view_mazes.view_env import (
-    VIEW_ENTRIES,
-    ViewMazeEnv,
-    ViewNetworkSettings,
-    fewest_actions,
-    optimal_view_return,
-    view_network,
-    visits,
-    walks,
-)
+from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv, ViewNetworkSettings
 from proposer_rl.tasks.view_mazes.view_levels import VIEW_SUFFIXES, ViewLevel, read_view_levels
 
 LOCATING = 4096  # levels by which the target is located among the bins
@@ -96,12 +88,12 @@ class ViewMazeTask(GridTask):
     level = ViewLevel
     suffixes = VIEW_SUFFIXES
     read_file = staticmethod(read_view_levels)
-    fewest_steps = staticmethod(fewest_actions)
+    fewest_steps = staticmethod(view_env.fewest_actions)
     probe_planes = 4  # walls, start, goal, and where the Solver goes
     steps_name = "fewest_actions"
     replayed = ("rollouts",)
     drop_finished = True
-    observed = VIEW_ENTRIES
+    observed = view_env.VIEW_ENTRIES
     counting = ", turns included"
     text_key = "> v < ^ start and direction, G goal, • the Solver's episode"
 
@@ -157,16 +149,16 @@ class ViewMazeTask(GridTask):
 
     def network(self) -> MemoryNetwork:
         """Returns the network of one Solver."""
-        return view_network(self._network)
+        return view_env.view_network(self._network)
 
     def optimal_return(self, levels: ViewLevel) -> Tensor:
         """Returns the largest expected return of any policy on levels [*B]: float [*B]."""
-        return optimal_view_return(levels, self.maze.max_steps)
+        return view_env.optimal_view_return(levels, self.maze.max_steps)
 
     def probe(self, agent: ActorCritic, levels: ViewLevel) -> Tensor:
         """Returns planes of levels [C] with the K Solvers' visits: float [K, C, 4, H, W]."""
         drawn = planes(for_copies(agent, levels))
-        went = visits(agent, levels, self.maze.max_steps)
+        went = view_env.visits(agent, levels, self.maze.max_steps)
         return torch.cat([drawn, went.unsqueeze(-3)], -3)
 
     def at_once(self, cells: int) -> int:
@@ -216,6 +208,6 @@ class ViewMazeTask(GridTask):
     ) -> NDArray[np.uint8]:
         """Draws a level, and one episode of one Solver there."""
         noise = torch.rand(max_steps, 1, generator=self._draws.generator("picture"))
-        went, steps = walks(agent, level.unsqueeze(0), max_steps, noise.to(self.device))
+        went, steps = view_env.walks(agent, level.unsqueeze(0), max_steps, noise.to(self.device))
         path = went[solver, 0, : int(steps[solver, 0]) + 1, :2]
         return draw_level(level, path).numpy()

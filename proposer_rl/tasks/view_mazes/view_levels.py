@@ -16,15 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from proposer_rl.runs.folder import read_bounded
-from proposer_rl.tasks.mazes.level_files import (
-    LARGEST_FILE_BYTES,
-    RECORD,
-    check_count,
-    check_size,
-    check_suffix,
-    named_levels,
-    read_levels,
-)
+from proposer_rl.tasks.mazes import level_files
 from proposer_rl.tasks.mazes.levels import FREE, GOAL, START, WALL, Level, drawn_rows
 
 AGENTS = (">", "v", "<", "^")
@@ -33,7 +25,7 @@ AGENTS = (">", "v", "<", "^")
 AHEAD = ((0, 1), (1, 0), (0, -1), (-1, 0))
 """Change of row and column on moving forward, by direction."""
 
-VIEW_SUFFIXES = (".txt", ".json", RECORD, ".py", ".npy")
+VIEW_SUFFIXES = (".txt", ".json", level_files.RECORD, ".py", ".npy")
 LARGEST_MODULE = 10**6  # bytes
 EMPTY_OBJECT, WALL_OBJECT, FLOOR_OBJECT, GOAL_OBJECT, AGENT_OBJECT = 1, 2, 3, 8, 10
 """Objects by MiniGrid's numbers."""
@@ -111,16 +103,16 @@ def read_view_levels(path: str | os.PathLike[str]) -> dict[str, ViewLevel]:
         StorageError: If it cannot be read.
     """
     path = Path(path)
-    check_suffix(path, VIEW_SUFFIXES)
-    content = read_bounded(path, LARGEST_FILE_BYTES)
+    level_files.check_suffix(path, VIEW_SUFFIXES)
+    content = read_bounded(path, level_files.LARGEST_FILE_BYTES)
     a_list = path.suffix == ".json" and content.lstrip().startswith(b"[")
     encoded = a_list or path.suffix == ".npy"
     if not encoded and path.suffix != ".py":
-        return cast(dict[str, ViewLevel], read_levels(path, ViewLevel))
+        return cast(dict[str, ViewLevel], level_files.read_levels(path, ViewLevel))
     try:
         drawn = _encoded(content, path) if encoded else _assigned(content)
         named = [(name, rows, None) for name, rows in drawn.items()]
-        return cast(dict[str, ViewLevel], named_levels(named, ViewLevel))
+        return cast(dict[str, ViewLevel], level_files.named_levels(named, ViewLevel))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -168,8 +160,8 @@ def _encoded(content: bytes, path: Path) -> Mapping[str, list[str]]:
             "must be MiniGrid's encoding of grids, whole numbers [W, H, 3] or [n, W, H, 3], got "
             f"{array.dtype} {list(array.shape)}"
         )
-    check_count(array.shape[0] if array.ndim == 4 else 1)
-    check_size(path.stem, *array.shape[-3:-1])
+    level_files.check_count(array.shape[0] if array.ndim == 4 else 1)
+    level_files.check_size(path.stem, *array.shape[-3:-1])
     if array.ndim == 3:
         return {path.stem: list(_drawn(array, path.stem))}
     names = [f"{path.stem}_{number}" for number in range(len(array))]

@@ -2,58 +2,60 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from proposer_rl.learning import PPOSettings, SolverSettings
 from proposer_rl.task import ComputeContext
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step
+from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
 from proposer_rl.tasks.batched_envs.task import BatchedTask
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings
 from proposer_rl.tasks.ranges import RangeSettings
 
 TOY = "tests.tasks.batched_envs.toys.WindyEnv"
 STILL = "tests.tasks.batched_envs.toys.StillEnv"
+WIDE = "tests.tasks.batched_envs.toys.WideEnv"
 
 
 class WindyEnv(BatchedEnv):
     """A ball begins between 0 and 1, and is pushed by the action and by the wind; 3 is the end."""
 
-    state_size: ClassVar[int] = 1
-    observation_size: ClassVar[int] = 2
-    draws: ClassVar[int] = 2
+    state_size = 1
+    observation_size = 2
+    draws = 2
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
         return chance[..., :1]
 
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         blown = level["wind"].unsqueeze(-1) * chance[..., 1:]
         place = (state + action + blown).squeeze(-1)
         return Step(place.unsqueeze(-1), -place.abs(), place > 3, place > 2)
 
-    def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:
+    def observe(self, state: Tensor, level: Values) -> Tensor:
         return torch.stack([state.squeeze(-1), level["wind"]], -1)
+
+
+class WideEnv(WindyEnv):
+    """Says that it shows more than it does."""
+
+    observation_size = 3
 
 
 class StillEnv(BatchedEnv):
     """Counts its choices, of three, from a whole number on; nothing is random."""
 
-    state_size: ClassVar[int] = 1
-    observation_size: ClassVar[int] = 1
-    actions: ClassVar[int | None] = 3
+    state_size = 1
+    observation_size = 1
+    actions = 3
 
-    def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
+    def begin(self, level: Values, chance: Tensor) -> Tensor:
         assert chance.shape == (*self.batch_size, 0)
         return level["first"].unsqueeze(-1).float()
 
-    def advance(
-        self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
-    ) -> Step:
+    def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         after = state + action.unsqueeze(-1)
         good = after.squeeze(-1) > 6
         return Step(after, good.float(), torch.zeros_like(good), good)
