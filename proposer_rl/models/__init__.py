@@ -2,6 +2,7 @@
 
 from proposer_rl.models.actor_critic import ActorCritic as ActorCritic
 from proposer_rl.models.actor_critic import categorical as categorical
+from proposer_rl.models.actor_critic import distribution_of as distribution_of
 from proposer_rl.models.actor_critic import draw_at as draw_at
 from proposer_rl.models.actor_critic import joint_categorical as joint_categorical
 from proposer_rl.models.actor_critic import normal as normal
@@ -11,7 +12,6 @@ from proposer_rl.models.grids import UNet as UNet
 from proposer_rl.models.grids import cell_logits as cell_logits
 from proposer_rl.models.grids import cell_maps as cell_maps
 from proposer_rl.models.grids import map_actor_critic as map_actor_critic
-from proposer_rl.models.grids import read_maps as read_maps
 from proposer_rl.models.memory import MemoryNetwork as MemoryNetwork
 from proposer_rl.models.memory import memory_actor_critic as memory_actor_critic
 from proposer_rl.models.population import Population as Population
@@ -21,7 +21,6 @@ from proposer_rl.models.proposer import MapEncoder as MapEncoder
 from proposer_rl.models.proposer import MixtureHead as MixtureHead
 from proposer_rl.models.proposer import ProblemHead as ProblemHead
 from proposer_rl.models.proposer import ProposerNetwork as ProposerNetwork
-from proposer_rl.models.proposer import fourier_encoding as fourier_encoding
 from proposer_rl.models.proposer import proposer_actor_critic as proposer_actor_critic
 from proposer_rl.models.torch_state import callers_state as callers_state
 from proposer_rl.models.torch_state import own_state as own_state

@@ -18,7 +18,7 @@ from tensordict.nn import (
 )
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Independent, Normal
-from torchrl.data import Unbounded
+from torchrl import data
 from torchrl.envs import TensorDictPrimer
 
 
@@ -159,7 +159,7 @@ class ActorCritic(TensorDictModuleBase):
         and collectors of other code; an agent without memory needs none.
         """
         device = next(self.parameters()).device
-        specs = {key: Unbounded((width,), device=device) for key, width in self.memory.items()}
+        specs = {key: data.Unbounded((width,), device=device) for key, width in self.memory.items()}
         return TensorDictPrimer(specs, default_value=0.0, expand_specs=True)
 
     def readout(self) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
@@ -187,6 +187,13 @@ def normal(logits: Tensor) -> Distribution:
     """Returns D normal numbers as one event, from their locations and log-scales [*B, D, 2]."""
     location, log_scale = logits.unbind(-1)
     return Independent(Normal(location, log_scale.exp(), validate_args=False), 1)
+
+
+def distribution_of(acts: data.TensorSpec) -> Callable[..., Distribution]:
+    """Returns what makes a policy's distribution of its logits, by the actions' spec."""
+    if isinstance(acts, data.MultiCategorical):
+        return joint_categorical
+    return categorical if isinstance(acts, data.Categorical) else normal
 
 
 def draw_at(distribution: Distribution, uniform: Tensor) -> Tensor:

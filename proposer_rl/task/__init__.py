@@ -15,7 +15,6 @@ from proposer_rl.task.protocols import OptimalTask as OptimalTask
 from proposer_rl.task.protocols import PlayableTask as PlayableTask
 from proposer_rl.task.protocols import Space as Space
 from proposer_rl.task.protocols import check_distributions as check_distributions
-from proposer_rl.task.protocols import distribution_of as distribution_of
 from proposer_rl.task.protocols import for_copies as for_copies
 from proposer_rl.task.protocols import level_inputs as level_inputs
 from proposer_rl.task.protocols import named as named

@@ -28,7 +28,7 @@ from proposer_rl.learning import (
     graphs,
     mean_performance,
 )
-from proposer_rl.models import ActorCritic, Population, memory_actor_critic, normal
+from proposer_rl.models import ActorCritic, Population, distribution_of, memory_actor_critic, normal
 from proposer_rl.runs.records import pixels, png, written
 from proposer_rl.streams import Streams
 from proposer_rl.task.protocols import (
@@ -38,7 +38,6 @@ from proposer_rl.task.protocols import (
     Levels,
     Space,
     check_distributions,
-    distribution_of,
     for_copies,
     level_inputs,
     space_features,

@@ -16,9 +16,8 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Categorical, MultiCategorical, TensorSpec
 
-from proposer_rl.models import ActorCritic, categorical, joint_categorical, normal
+from proposer_rl.models import ActorCritic
 from proposer_rl.settings import ArgumentError
 
 MANY_BINS = 256  # beyond which a model of outcomes has no coefficient for each of them
@@ -289,13 +288,6 @@ def level_inputs(space: Any, levels: Levels) -> Tensor:
             known: Tensor = getattr(space, name)(levels).double().cpu()
             return known
     return torch.zeros(*levels.shape, 0, dtype=torch.float64)
-
-
-def distribution_of(acts: TensorSpec) -> Callable[..., torch.distributions.Distribution]:
-    """Returns what makes a policy's distribution of its logits, by the actions' spec."""
-    if isinstance(acts, MultiCategorical):
-        return joint_categorical
-    return categorical if isinstance(acts, Categorical) else normal
 
 
 def for_copies(agent: ActorCritic, levels: Levels) -> Levels:

@@ -19,9 +19,9 @@ from proposer_rl.models import (
     draw_at,
     joint_categorical,
     map_actor_critic,
-    read_maps,
     uniform_noise,
 )
+from proposer_rl.models.grids import read_maps
 from tests.draws import generators
 
 K, P, T, H, W = 2, 3, 5, 6, 7

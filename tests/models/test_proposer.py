@@ -13,11 +13,11 @@ from proposer_rl.models import (
     ProposerNetwork,
     categorical,
     draw_at,
-    fourier_encoding,
     joint_categorical,
     normal,
     proposer_actor_critic,
 )
+from proposer_rl.models.proposer import fourier_encoding
 
 
 def maps(features: int) -> MapEncoder:
