@@ -1,33 +1,52 @@
-"""Episodes of arena environments, played by scripted policies."""
+"""Episodes of arena environments, played to their ends by scripted policies."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
 from proposer_rl.tasks.batched_envs.env import BatchedEnv
 
 
-def levels(**columns: list[float] | list[int] | Tensor) -> TensorDict:
-    """Returns levels [B] of columns of numbers."""
-    entries = {name: torch.as_tensor(column) for name, column in columns.items()}
+def levels(seeds: int | None = None, **parameters: Any) -> TensorDict:
+    """Levels [B] of columns of numbers; of so many seeds, a parameter may have one number."""
+    entries = {name: torch.as_tensor(value) for name, value in parameters.items()}
+    if seeds is not None:
+        entries = {name: value.expand(seeds) for name, value in entries.items()}
+        entries["seed"] = torch.arange(seeds)
     return TensorDict(entries, [len(next(iter(entries.values())))])
 
 
-def play(env: BatchedEnv, policy: Callable[[TensorDictBase], Tensor]) -> tuple[Tensor, Tensor]:
-    """Plays an episode on each level [B]; returns return and success, float and bool [B]."""
+def played(
+    kind: type[BatchedEnv], given: TensorDict, steps: int, act: Callable[[Any], Tensor]
+) -> Mapping[str, Tensor]:
+    """What :func:`episodes` gives of levels [B] and a step limit."""
+    return episodes(kind(given, max_steps=steps), act)
+
+
+def play(env: BatchedEnv, act: Callable[[Any], Tensor]) -> tuple[Tensor, Tensor]:
+    """Return and success [B] of :func:`episodes` where TorchRL finds nothing wrong."""
     check_env_specs(env)
-    now = env.reset()
-    total = torch.zeros(env.batch_size)
-    over, success = now["done"].squeeze(-1), now["success"].squeeze(-1)
+    ends = episodes(env, act)
+    return ends["return"], ends["success"]
+
+
+def episodes(env: BatchedEnv, act: Callable[[Any], Tensor]) -> Mapping[str, Tensor]:
+    """The success, return and steps [B] of an episode each, with the places [B, T, S]."""
+    state, (count,) = env.reset(), env.batch_size
+    going, total, length = (torch.ones(count) * begin for begin in (1, 0, 0))
+    success, places = torch.zeros(count, dtype=torch.bool), []
     for _ in range(env.max_steps):
-        now = env.step(now.set("action", policy(now)))["next"]
-        total += now["reward"].squeeze(-1) * ~over
-        success |= now["success"].squeeze(-1) & ~over
-        over |= now["done"].squeeze(-1)
-    assert over.all()
-    return total, success
+        state = env.step(state.set("action", act(state)))["next"]
+        total, length = total + going * state["reward"].squeeze(-1), length + going
+        success |= state["success"].squeeze(-1) & going.bool()
+        going = going * ~state["done"].squeeze(-1)
+        places.append(state["state"])
+        state = state.exclude("reward")
+    assert not going.any()
+    return {"success": success, "return": total, "steps": length, "places": torch.stack(places, 1)}

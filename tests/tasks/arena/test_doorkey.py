@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
 from proposer_rl.tasks.arena.doorkey import DoorkeyEnv
-from tests.tasks.arena.first_ends import levels
+from tests.tasks.arena.episodes import levels
 
 STEPS, SIZES = 60, (5, 6, 7, 8)
 LIKELY = [0.15, 0.15, 0.4, 0.1, 0.05, 0.14, 0.01]  # of each action, so that much happens

@@ -9,7 +9,7 @@ from torchrl.envs import check_env_specs
 
 from proposer_rl.tasks.arena.stumps import StumpsEnv
 from proposer_rl.tasks.batched_envs.env import uniform
-from tests.tasks.arena.first_ends import levels, played
+from tests.tasks.arena.episodes import levels, played
 
 STEPS = 80
 
