@@ -83,6 +83,11 @@ class BatchedTask(Task):
         self._try(env, list(parameters))
 
     def _try(self, name: str, parameters: list[str]) -> None:
+        """Takes a step on one level, which must read no more and make no other sizes than is said.
+
+        Raises:
+            ArgumentError: naming the key.
+        """
         env = self.environment(self.evaluated_on["target"][:1])
         try:
             first = env.reset()
