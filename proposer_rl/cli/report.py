@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from proposer_rl.cli.errors import command, number
+from proposer_rl.cli.errors import ConfigError, command, number
 from proposer_rl.cli.help import choices
 from proposer_rl.recipes import CONFIG_FOLDER
 
@@ -35,7 +35,16 @@ def _run(options: argparse.Namespace) -> None:
     from proposer_rl.report.reading import find_runs
     from proposer_rl.runs.records import printable
 
-    if all(path.suffix == ".jsonl" for path in options.folder):
+    logs = [path for path in options.folder if path.suffix == ".jsonl"]
+    if logs:
+        of_runs = [str(path) for path in options.folder if path not in logs]
+        of_runs += [] if options.threshold is None else ["--threshold"]
+        of_runs += [] if options.baseline is None else ["--baseline"]
+        if of_runs:
+            raise ConfigError(
+                f"{of_runs[0]}: is for a report of runs; {logs[0]} is a log of a teacher, which "
+                "comes in a report of its own"
+            )
         from proposer_rl.report.teachers import write_teachers
 
         print(printable(f"Report: {write_teachers(options.folder, options.output)}"))

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from proposer_rl.report import arena, figures, outcomes, page, runs
 from proposer_rl.report.charts import charts
 from proposer_rl.report.outcomes import Meanings, answer
-from proposer_rl.report.reading import OutputError, find_runs
+from proposer_rl.report.reading import OutputError, begun, find_runs
 from proposer_rl.report.statistics import FEWEST, HELD
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, render
@@ -53,8 +53,10 @@ def read_checked(
     folders: Sequence[Path], threshold: float | None, baselines: Sequence[str]
 ) -> tuple[list[Study], list[str]]:
     """The studies of the runs in some folders; see :func:`write_report`."""
-    first = next(iter(baselines), None)
-    studies, notes = read_studies(find_runs(folders), threshold, first)
+    first, found = next(iter(baselines), None), find_runs(folders)
+    studies, notes = read_studies(found, threshold, first)
+    unmeasured = {path for folder in folders for path in begun(folder)} - {*found}
+    notes += [f"not read: {path.name}: it has measured nothing" for path in sorted(unmeasured)]
     labels = sorted({group.label for study in studies for group in study.compared})
     for baseline in baselines:
         if baseline not in labels:

@@ -151,7 +151,7 @@ def _draw_bars(figure: FigureBase, study: Study) -> None:
             fontsize=8,
         )
     axes.set_yticks(range(len(found)), [fill(group.label, 32) for _, group in found], fontsize=8)
-    axes.set_xlim(0, horizon * 1.42)
+    axes.set_xlim(0, max(horizon, 1) * 1.42)  # of a run that has just begun
     axes.set_xticks([tick for tick in axes.get_xticks() if tick <= horizon])
     axes.axvline(horizon, color="0.4", linewidth=0.8, linestyle=":")
     axes.grid(axis="y", visible=False)

@@ -158,8 +158,9 @@ def worst(study: Study) -> list[Measure]:
 
 def axis_text(name: str) -> str:
     """A measurement as an axis is named."""
-    rate = " rate" if is_rate(name) else ""
-    return f"{words(name).replace('worst10', 'on the worst 10 %')}{rate}"
+    plain = name.removesuffix("_worst10")
+    worst = " on the worst 10 %" if plain != name else ""
+    return f"{words(plain)}{' rate' if is_rate(name) else ''}{worst}"
 
 
 def over_updates(group: Group, name: str, table: str = "metrics") -> Series | None:

@@ -191,8 +191,10 @@ def answer(study: Study) -> tuple[str, str]:
     best, *others = ranked
     median = write(outcome.median(best))
     if not others:
+        alone = "here" if len(study.groups) == 1 else f"with runs of {study.horizon} updates"
         return (
-            f"{best.label} is the only method here ({outcome.name}: {median}, median over seeds).",
+            f"{best.label} is the only method {alone} ({outcome.name}: {median}, median over "
+            "seeds).",
             "Nothing is compared, so this page does not show whether that is good.",
         )
     found = decisions(study)

@@ -92,32 +92,38 @@ def difference_of(one: Values, other: Values, paired: bool = False) -> Estimate:
     value = float(a.mean() - b.mean())
     if min(len(a), len(b)) < FEWEST or np.ptp(a) == np.ptp(b) == 0:
         return Estimate(value, math.nan, 1.0)
-    squares = [x.var(ddof=1) / len(x) for x in (a, b)]
-    parts = [square**2 / (len(x) - 1) for square, x in zip(squares, (a, b), strict=True)]
-    return Estimate(value, math.sqrt(sum(squares)), float(sum(squares) ** 2 / sum(parts)))
+    return _of_sum(value, [x.var(ddof=1) / len(x) for x in (a, b)], [len(a) - 1, len(b) - 1])
 
 
 def mean_of_estimates(found: Sequence[Estimate]) -> Estimate:
-    """Mean of independent estimates, which count alike: their squared errors add up.
+    """Returns the mean of independent estimates, which count alike.
 
-    With Satterthwaite's degrees of freedom (Biometrics Bulletin 2, 1946). Without an error where
-    one is not known, or none has any.
+    Its error is NaN where one of theirs is not known, or none has any.
     """
     value = float(np.mean([one.value for one in found]))
     squares = [one.error**2 for one in found]
     if not sum(squares) > 0:
         return Estimate(value, math.nan, 1.0)
-    parts = [square**2 / one.freedom for square, one in zip(squares, found, strict=True)]
-    return Estimate(value, math.sqrt(sum(squares)) / len(found), sum(squares) ** 2 / sum(parts))
+    of_sum = _of_sum(value, squares, [one.freedom for one in found])
+    return of_sum._replace(error=of_sum.error / len(found))
 
 
 def balanced(one: Values, other: Values) -> Estimate:
     """Welch's difference if both had as many values as the fewer, and the variances seen."""
     a, b = (np.asarray(values, dtype=float) for values in (one, other))
-    count, variances = min(len(a), len(b)), np.array([a.var(ddof=1), b.var(ddof=1)])
-    whole, squares = float(variances.sum()), float((variances**2).sum())
-    freedom = whole**2 / squares * (count - 1)
-    return Estimate(float(a.mean() - b.mean()), math.sqrt(whole / count), freedom)
+    count = min(len(a), len(b))
+    squares = [x.var(ddof=1) / count for x in (a, b)]
+    return _of_sum(float(a.mean() - b.mean()), squares, [count - 1] * 2)
+
+
+def _of_sum(value: float, squares: Sequence[float], freedoms: Sequence[float]) -> Estimate:
+    """Returns an estimate whose squared error is the sum of independent ones.
+
+    Its degrees of freedom are Satterthwaite's (Biometrics Bulletin 2, 1946).
+    """
+    whole = float(sum(squares))
+    parts = [square**2 / freedom for square, freedom in zip(squares, freedoms, strict=True)]
+    return Estimate(value, math.sqrt(whole), whole**2 / float(sum(parts)))
 
 
 def median_of(values: Values) -> tuple[Any, Any, Any]:

@@ -63,8 +63,9 @@ def write_teachers(files: Sequence[Path], output: Path) -> Path:
     """
     logs = {}
     for file in files:
-        label = file.stem if file.stem not in logs else str(file)
-        logs[printable(label)[:80]] = read_log(file)
+        name = printable(file.stem)[:80]
+        # What tells two paths from each other stands rather at their ends.
+        logs[name if name not in logs else printable(str(file))[-80:]] = read_log(file)
     check_output(output, PAGE, "report.html")
     output.mkdir(parents=True, exist_ok=True)
     figures = [

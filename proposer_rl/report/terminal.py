@@ -248,7 +248,7 @@ def _cycles(run: Run) -> list[RenderableType]:
         values = [value for c in run.cycles if not math.isnan(value := number(c.get(name)))]
         if values:
             drawn = sparkline(_some(values), min(values), max(values))
-            grid.add_row(Text(words(name)), Text(drawn), f"{values[-1]:.4g}")
+            grid.add_row(Text(name.replace("_", " ")), Text(drawn), f"{values[-1]:.4g}")
     parts: list[RenderableType] = [grid]
     if batch := batch_shares(cycle):
         told = ", ".join(f"{name} {share:.0%}" for name, share in batch.items())
