@@ -270,7 +270,7 @@ def domain_randomization(space: Space) -> SamplingCurriculum:
 
 @checked
 def schedule(components: Components, distributions: list[str], until: list[int]) -> Curriculum:
-    """Train on named distributions one after another: a hand-designed curriculum.
+    """Trains on named distributions one after another: a hand-designed curriculum.
 
     Args:
         components: the task.

@@ -27,7 +27,7 @@ the finished ones are named; they are in the figures as far as they got, not in 
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
+    """Runs the command; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
     command(partial(_run, _parser().parse_args(arguments)))
 
 

@@ -62,7 +62,7 @@ class Traces(Callback):
 
 
 def main() -> None:
-    """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
+    """Runs the command; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
     # Hydra then lets its errors through, so that they can be told in one line.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     command(_compose_and_run)
@@ -120,7 +120,7 @@ def _main(hydra_config: DictConfig) -> float:
 
 
 def _refuse_pickles(arguments: list[str]) -> None:
-    """Hydra's --experimental-rerun reads a pickle, which can run whatever it likes."""
+    """Refuses --experimental-rerun, with which Hydra reads a pickle, that is, runs code."""
     if any(argument.startswith("--experimental-rerun") for argument in arguments):
         raise ConfigError("--experimental-rerun: not supported; give the run's own arguments again")
 

@@ -116,7 +116,7 @@ def start(
 
 
 def lost(settings: WorkerSettings) -> tuple[type[Exception], ...]:
-    """Returns the errors that a collector raises where a worker is lost."""
+    """Returns the exception classes by which a collector reports a lost worker."""
     if settings.engine != "ray":
         return LOST
     from ray.exceptions import RayError

@@ -137,7 +137,7 @@ class ActorCritic(TensorDictModuleBase):
         )
 
     def actor(self, *, sample: bool = False) -> ProbabilisticTensorDictSequential:
-        """This actor-critic as a TorchRL policy, for collectors and losses of other code.
+        """Returns this actor-critic as a TorchRL policy, for collectors and losses of other code.
 
         An environment around which an agent with memory acts needs its :meth:`primer`. The critic
         of a loss is the agent itself. TorchRL's ``GAE`` takes ``value_network=None``: the values of

@@ -48,7 +48,7 @@ HEADERS = {
 
 
 def application(session: Session, token: str) -> Starlette:
-    """The page and what it asks, all below ``/TOKEN/``."""
+    """Returns the application: the page, and what it asks for, all below ``/TOKEN/``."""
     asked: dict[str, tuple[Any, Callable[[Any], Any]]] = {
         "examine": (Examine, session.examine),
         "levels": (Source, session.levels),
@@ -80,7 +80,7 @@ class Guard:
         self._app, self._token = app, token.encode()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or refuse it."""
+        """Answers a request, or refuses it."""
 
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -103,7 +103,7 @@ class Guard:
 
 
 def listen(port: int) -> socket.socket:
-    """A socket on the loopback address, at port 0 on a free one.
+    """Returns a socket on the loopback address; port 0 takes a free one.
 
     Raises:
         OSError: if it cannot be had.
@@ -120,7 +120,7 @@ def listen(port: int) -> socket.socket:
 
 
 def server(app: Starlette) -> uvicorn.Server:
-    """What answers: ``run(sockets=[listen(0)])`` it, until a signal comes."""
+    """Returns a server; ``run(sockets=[listen(0)])`` answers until a signal comes."""
     return uvicorn.Server(
         uvicorn.Config(
             app,
@@ -162,7 +162,7 @@ async def _answered(kind: Any, function: Callable[[Any], Any], request: Request)
 
 
 async def _result(function: Callable[[], Any]) -> Response:
-    """What a function returns, as JSON; or in one line why it does not."""
+    """Returns what a function returns, as JSON; or the line of its error."""
     try:
         return JSONResponse(await run_in_threadpool(function))
     except (ValueError, OSError) as error:
