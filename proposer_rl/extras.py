@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 def install_command(extra: str) -> str:
     """Returns the command that installs an extra into this process's environment.
 
-    Of a checkout, with the versions that its commands pin. Elsewhere the package is installed
+    In a checkout it takes the versions that are pinned there. Elsewhere the package is installed
     already, so that no index is asked for it.
     """
     what = [f"proposer_rl[{extra}]"]

@@ -74,7 +74,7 @@ Given its device; it can be pickled.
 
 
 class Components(NamedTuple):
-    """What a run has, of which curricula are made.
+    """The parts of a run that curricula are made of.
 
     Attributes:
         task: what is to be learnt.

@@ -31,7 +31,7 @@ T = TypeVar("T")
 P = ParamSpec("P")
 
 Count = Annotated[int, Interval(ge=1, le=1_000_000)]
-"""Of what is counted, at least one: more than a million would not fit, or never come to pass."""
+"""A count from 1 to a million; a larger one is most likely a typing error."""
 Share = Annotated[float, Interval(ge=0, le=1)]
 """A part of a whole, or a probability."""
 Decay = Annotated[float, Interval(ge=0, lt=1)]
@@ -45,7 +45,7 @@ NotNegative = Annotated[float, Ge(0)]
 SHOULD = "input should be "  # as pydantic begins most of its lines
 
 BY_KIND = Discriminator("kind")
-"""Of a union of settings, each of which has an entry ``kind`` of its own."""
+"""Tells the members of a union of settings apart, by the entry ``kind`` of each."""
 
 
 class ArgumentError(ValueError):

@@ -27,7 +27,7 @@ from proposer_rl.task import ComputeContext, Task
 
 
 class Made(NamedTuple):
-    """What an experiment is made of."""
+    """The task, the Solvers and the curriculum of an experiment."""
 
     task: Task
     learner: PPO

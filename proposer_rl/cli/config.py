@@ -69,7 +69,7 @@ class HandDesignedSettings:
 
 @settings
 class PoolSettings:
-    """How many levels curricula keep, and choose among.
+    """Settings of curricula that keep levels: how many, and among how many they choose.
 
     Attributes:
         capacity: levels of a buffer.
@@ -86,7 +86,7 @@ class PoolSettings:
 
 @settings
 class LoggerSettings:
-    """Where rows of metrics go besides the run's folder.
+    """Settings of the logger that gets rows of metrics besides the run's folder.
 
     Attributes:
         type: ``csv`` for nowhere.
@@ -101,7 +101,7 @@ class LoggerSettings:
 
 @settings
 class ComputeSettings:
-    """Where and how a run is computed, which changes no numbers beyond rounding.
+    """Settings of where a run is computed, which change no numbers beyond rounding.
 
     Attributes:
         device: ``auto``: cuda where there is one, else cpu.

@@ -48,7 +48,7 @@ FALLING = "solver.ppo.anneal_updates"
 
 
 class Shown(Protocol):
-    """What draws and prints a run's results: the interface of :mod:`proposer_rl.cli.shown`."""
+    """The interface of :mod:`proposer_rl.cli.shown`, which draws and prints a run's results."""
 
     def draw_run(self, folder: Path, title: str) -> Path:
         """Draws the picture of a run that is over; returns its file."""

@@ -106,7 +106,7 @@ EXACT: dict[str, tuple[tuple[str, ...], Callable[[Student, Levels], Tensor]]] = 
     ),
     "gradient_norm": (("gradient_norms",), lambda s, levels: s.gradient_norms(levels)),
 }
-"""Of each score what it needs of a student, and what it is: float [K, n] of levels [K, n]."""
+"""The functions that each score needs of a student, and its formula: float [K, n]."""
 
 
 class Episodes(NamedTuple):

@@ -116,7 +116,7 @@ class Experiment:
 
     @property
     def costs(self) -> dict[str, float]:
-        """What each Solver has cost so far.
+        """The costs of each Solver so far, by name.
 
         ``frames``: environment steps of its own training; ``curriculum_frames`` and
         ``evaluations``: steps, and evaluations of a policy on a level, that the curriculum asked
@@ -343,7 +343,7 @@ class Experiment:
 
 @settings
 class ScheduleSettings:
-    """How long a run is, and what happens how often; all in Solver updates.
+    """Settings of a run's length and of what happens how often, in Solver updates.
 
     Attributes:
         updates: length of the run.

@@ -32,7 +32,7 @@ class WorkersError(RuntimeError):
 
 
 class WorkerSettings(NamedTuple):
-    """Where the replicas of the Solver are trained, if not in this process.
+    """Settings of the worker processes in which replicas of the Solver are trained.
 
     Attributes:
         engine: ``"multiprocess"``: processes of this machine, by TorchRL's

@@ -73,7 +73,7 @@ class RunningMoments(nn.Module):
 
 
 class Normalization(nn.Module):
-    """What an agent is shown, and the unit of its values.
+    """Running standardisation of an agent's observations and of the unit of its values.
 
     Rewards stay what they are. Instead the critic's outputs are multiplied with the standard
     deviation of the discounted return, and its loss is taken in that unit: the same as rewards

@@ -12,7 +12,7 @@ import torch
 
 
 class _State(NamedTuple):
-    """What decides on results wherever nothing else is said."""
+    """Torch's defaults that results depend on."""
 
     dtype: torch.dtype
     gradients: bool

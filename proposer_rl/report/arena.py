@@ -37,7 +37,7 @@ class Arena:
 
     @property
     def reference(self) -> str:
-        """What methods are measured against, in words."""
+        """The baselines that methods are measured against, in words."""
         *others, last = self.baselines
         return f"the better of {', '.join(others)} and {last}" if others else last
 

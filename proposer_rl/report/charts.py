@@ -137,7 +137,7 @@ def _estimate(study: Study, group: Group, outcome: Outcome) -> Sequence[float]:
 def _stages(study: Study) -> dict[str, Json] | None:
     """Returns what the page's slider shows: one run of each method, the first with recorded levels.
 
-    Where none of a method's runs did, the first that recorded proposals.
+    If none of a method's runs has any, it is the first that recorded proposals.
 
     Returns:
         ``axes``: names and values of the space of levels, at most two. ``pictures``: each once, a
@@ -216,7 +216,7 @@ def _level(level: LevelRecord, pictures: dict[str, int]) -> Json:
 def _small(stored: str | None) -> str | None:
     """Returns a picture as PNG in base64, scaled down for display; None if it cannot be read.
 
-    Where all do not fit, the same are asked for again.
+    Results are kept, since fewer stages are tried with the same pictures if all do not fit.
     """
     pixels = picture(stored)
     if pixels is None:

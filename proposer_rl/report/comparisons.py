@@ -51,7 +51,7 @@ class Outcome(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """Which of two methods is better, by an outcome.
+    """The decision on which of two methods is better, by an outcome.
 
     Attributes:
         winner: its label; None where neither is said to be better.

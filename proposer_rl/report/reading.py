@@ -45,7 +45,7 @@ class UnreadableRun(ValueError):
 
 
 class OutputError(ValueError):
-    """What was asked for cannot be written; the message is one line."""
+    """The report that was asked for cannot be written; the message is one line."""
 
     exit_code = 2
 

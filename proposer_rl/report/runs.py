@@ -86,7 +86,7 @@ class Run:
 
     @property
     def student(self) -> int | None:
-        """Which of several Solvers of one Proposer this was, from 0; None for a lone one."""
+        """The number of this Solver among those of one Proposer, from 0; None for a lone one."""
         found = _STUDENT.fullmatch(self.folder.name)
         return int(found[1]) if found else None
 
@@ -168,8 +168,8 @@ class Run:
     def waited(self, measurement: str, threshold: float, horizon: float) -> float:
         """Returns updates until a threshold, cut at a horizon; NaN for a shorter run.
 
-        Also where it was reached: short runs that did would else count, and those that did not
-        would not.
+        It is NaN also if a shorter run reached the threshold: else only short runs that are fast
+        would count.
         """
         if self.updates < horizon:
             return math.nan

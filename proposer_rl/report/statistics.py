@@ -217,7 +217,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 def seeds_needed(difference: Estimate, seeds: int, level: float) -> int | None:
     """Returns about how many seeds would show a difference as large as the one seen.
 
-    With a power of 80 %: the two quantiles of Student's distribution, of the test and of the power,
+    The power is 80 %. The two quantiles of Student's distribution, of the test and of the power,
     add up to the difference in standard errors, which fall with the root of the number of seeds
     (Cohen, Statistical Power Analysis, 1988).
 

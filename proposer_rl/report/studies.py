@@ -126,7 +126,7 @@ class Study:
 
     @property
     def baseline(self) -> Group:
-        """What the others are measured against: the chosen one, the usual one, or the first."""
+        """The group that others are compared with: the chosen one, the usual one, or the first."""
         return self.group(self.chosen or "") or self.group(USUAL_BASELINE) or self.compared[0]
 
     def scores(self, group: Group, name: str) -> Column | None:
@@ -198,7 +198,7 @@ def _setting(run: Run) -> dict[str, Any]:
 def _variant(run: Run) -> dict[str, Any]:
     """Returns everything that a run's outcome may depend on, apart from its seed.
 
-    Of the settings alone, so that a run counts where it will when it is finished.
+    It consists of settings alone, so that an unfinished run is in the group of its finished ones.
     """
     ignored = {"seed", "seeds", "schedule", "checkpoint"}  # the curriculum has the last
     # Proposers that differ in their seed alone are as much a matter of chance as Solvers.
@@ -269,8 +269,8 @@ def _plain_label(run: Run) -> str:
 def _labels(plain: str, alike: Sequence[Sequence[Run]]) -> list[tuple[str, str]]:
     """Returns labels of variants of one name, and the settings in which each differs.
 
-    As they were written on the command line, or else as they stand in the configurations. Where
-    these are few they are the label, else the variants are numbered.
+    Settings are as on the command line, or else as in the configurations. Short ones are part of
+    the label; otherwise the variants are numbered.
     """
     if len(alike) == 1:
         return [(plain, "")]

@@ -74,7 +74,7 @@ class Progress:
 
     @property
     def state(self) -> str:
-        """In a word: failed, finished, unfinished (running or interrupted) or starting."""
+        """The state in a word: failed, finished, unfinished (or running), or starting."""
         if self.failure:
             return "failed"
         if not self.runs:

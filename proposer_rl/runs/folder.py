@@ -102,7 +102,7 @@ class RunFolder:
         _sync_folder(self.path)
 
     def write_json(self, name: str, value: object) -> None:
-        """Writes a JSON file; whoever reads it sees the old content or the new, never a part."""
+        """Writes a JSON file; a reader sees the old content or the new, never a part."""
         path = self.path / name
         write_atomically(path, (_json(path, value, indent=2) + "\n").encode())
 

@@ -39,7 +39,7 @@ class Interrupted(Exception):
 
     @property
     def exit_code(self) -> int:
-        """That of a process which the signal ends, as shells have it."""
+        """The exit code of a process that the signal ends, as in shells."""
         return 128 + self.signum
 
 
@@ -48,7 +48,7 @@ class StopRequested(Exception):
 
 
 class StopSignals:
-    """Inside this context a stop signal is kept until the run comes to a safe point.
+    """A context in which a stop signal is kept until the run comes to a safe point.
 
     A second SIGINT is not kept: it raises KeyboardInterrupt at once. A signal that is ignored (as
     ``nohup`` has it) stays so. Outside of the main thread nothing is changed, since Python delivers

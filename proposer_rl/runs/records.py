@@ -61,7 +61,7 @@ Sheets = Annotated[dict[Name, list[LevelRecord]], Field(max_length=16)]
 
 
 class LevelResults(BaseModel):
-    """What a seed reached on every level of a distribution."""
+    """A seed's results on every level of a distribution."""
 
     updates: int
     seed: int
@@ -79,7 +79,7 @@ class SampleRecord(BaseModel):
 
 
 class TaskFacts(BaseModel):
-    """What a run says of its task, for a reader.
+    """A run's description of its task, for its readers.
 
     Attributes:
         title: what it is, as ``6×6 mazes``.
@@ -191,7 +191,7 @@ def numbers(value: Any) -> Column | None:
 def batch_shares(record: Record) -> dict[str, float]:
     """Returns a record's ``shares`` of a batch by the names of its parts.
 
-    Of several students the mean; empty where a record has none.
+    A share is the mean over several students; the result is empty where a record has none.
     """
     told = record.get("shares")
     means = {name: number(own) for name, own in told.items()} if isinstance(told, Mapping) else {}

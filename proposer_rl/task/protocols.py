@@ -34,7 +34,7 @@ class NoSuccessError(ValueError):
 
 
 class ComputeContext(NamedTuple):
-    """Where and how exactly a task computes; what makes a task is called with one.
+    """The device and precision with which a task computes, given to what makes tasks.
 
     Attributes:
         device: where Solvers and levels live.
@@ -82,7 +82,7 @@ class Space(Distribution, Protocol):
 
 
 class LevelResult(NamedTuple):
-    """What one Solver reaches on one level, as ``bin/eval`` lists it.
+    """One Solver's results on one level, as ``bin/eval`` lists them.
 
     Attributes:
         level: the level's name.
@@ -140,7 +140,7 @@ class EditableTask(Protocol):
 
 
 class CellKind(NamedTuple):
-    """What a cell of a drawing can be.
+    """A kind of cell in a drawing.
 
     Attributes:
         mark: its character.

@@ -22,7 +22,7 @@ UNIT = 2.0**-24  # between neighbouring numbers of :func:`uniform`
 
 
 class Step(NamedTuple):
-    """What a step leads to, in an environment of batch shape [*B].
+    """The result of a step, in an environment of batch shape [*B].
 
     Attributes:
         state: float [*B, S], the next one.
