@@ -37,13 +37,9 @@ def _run(options: argparse.Namespace) -> None:
 
     logs = [path for path in options.folder if path.suffix == ".jsonl"]
     if logs:
-        of_runs = [str(path) for path in options.folder if path not in logs]
-        of_runs += [] if options.threshold is None else ["--threshold"]
-        of_runs += [] if options.baseline is None else ["--baseline"]
-        if of_runs:
+        if len(logs) < len(options.folder) or options.threshold is not None or options.baseline:
             raise ConfigError(
-                f"{of_runs[0]}: is for a report of runs; {logs[0]} is a log of a teacher, which "
-                "comes in a report of its own"
+                f"{logs[0]}: is a teacher's log, reported without runs, --threshold and --baseline"
             )
         from proposer_rl.report.teachers import write_teachers
 

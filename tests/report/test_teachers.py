@@ -74,8 +74,7 @@ def test_what_is_of_runs_is_refused_beside_a_log(
 ) -> None:
     with pytest.raises(SystemExit) as end:
         main(["x.jsonl", *more, "-o", str(tmp_path / "page")])
-    name = more[0].partition("=")[0]
-    assert end.value.code == 2 and capsys.readouterr().err.startswith(f"error: {name}: is for a")
+    assert end.value.code == 2 and "without runs, --threshold and --base" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
