@@ -157,11 +157,11 @@ class Run:
         return self.folder / "run.png"
 
     def solver(self) -> ActorCritic:
-        """The trained Solvers, from the newest checkpoint; see :meth:`ActorCritic.actor`."""
+        """Returns the trained Solvers of the newest checkpoint; see :meth:`ActorCritic.actor`."""
         return self._stored()[1]
 
     def task(self) -> Task:
-        """The task that they were trained on."""
+        """Returns the task that they were trained on."""
         return self._stored()[0]
 
     def _stored(self) -> tuple[Task, ActorCritic]:
@@ -188,7 +188,7 @@ def train(
     settings: Mapping[str, Any] | None = None,
     progress: bool = True,
 ) -> Run:
-    """Train a Solver on a task with a curriculum.
+    """Trains a Solver on a task with a curriculum.
 
     The run is that of ``bin/train`` with the same settings, to the bit on one machine, and so is
     its folder. Called again with the same folder, it goes on with a run that was interrupted.

@@ -10,9 +10,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def install_command(extra: str) -> str:
-    """The line that installs an extra into the environment that this process runs in.
+    """Returns the command that installs an extra into this process's environment.
 
-    Of a checkout, with the versions that its commands pin. Elsewhere the package is installed
+    In a checkout it takes the versions that are pinned there. Elsewhere the package is installed
     already, so that no index is asked for it.
     """
     what = [f"proposer_rl[{extra}]"]

@@ -74,7 +74,7 @@ Given its device; it can be pickled.
 
 
 class Components(NamedTuple):
-    """What a run has, of which curricula are made.
+    """The parts of a run that curricula are made of.
 
     Attributes:
         task: what is to be learnt.
@@ -270,7 +270,7 @@ def domain_randomization(space: Space) -> SamplingCurriculum:
 
 @checked
 def schedule(components: Components, distributions: list[str], until: list[int]) -> Curriculum:
-    """Train on named distributions one after another: a hand-designed curriculum.
+    """Trains on named distributions one after another: a hand-designed curriculum.
 
     Args:
         components: the task.

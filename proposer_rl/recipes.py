@@ -46,7 +46,7 @@ class Recipe:
     target: str | None = None
 
     def overrides(self) -> list[str]:
-        """The same on the command line, but for what is one's own."""
+        """Returns the same for the command line, without what is one's own."""
         if self.target is not None:
             # As most tasks call what is to be mastered; a headline that is given comes after it.
             return ["~task", "schedule.headline=target_success"] if self.group == "task" else []
@@ -59,7 +59,7 @@ class Recipe:
         return [f"{group}={self.name}", *given]
 
     def by_key(self) -> dict[str, dict[str, Any]]:
-        """The settings by the keys that they stand below, the first that the file has them at."""
+        """Returns the settings by the key of the configuration that they stand below."""
         known = {self._key: {}} if self.target else _by_key(self.group, self.name)
         found: dict[str, dict[str, Any]] = {}
         for name, value in self.settings.items():
@@ -68,7 +68,7 @@ class Recipe:
         return found
 
     def own(self) -> dict[str, Any]:
-        """The part of the configuration that no file has: one's own task or curriculum."""
+        """Returns the configuration of one's own task or curriculum, which no file has."""
         if self.target is None:
             return {}
         named = {"method": self.name} if self.group == "method" else {}
@@ -84,7 +84,7 @@ class Recipe:
 def own_recipe(
     group: Literal["task", "method"], make: Callable[..., Any], **settings: Any
 ) -> Recipe:
-    """A recipe for a class or function of one's own, which other processes can import.
+    """Returns a recipe for a class or function of one's own, which must be importable.
 
     Args:
         group: ``"task"``, or ``"method"`` for a curriculum.
@@ -109,12 +109,12 @@ def _dotted(name: str, function: Any) -> str:
 
 
 def available(group: str, folder: Path = CONFIG_FOLDER) -> list[str]:
-    """The names of the files of a group such as ``method``, in a folder of configurations."""
+    """Returns the names of a group's files, such as ``method``, in a folder of configurations."""
     return sorted(file.stem for file in (folder / group).glob("*.yaml"))
 
 
 def recipe_function(group: Literal["task", "method"], name: str) -> Callable[..., Recipe]:
-    """The function ``prl.curricula.NAME`` or ``prl.tasks.NAME``, with its file's settings.
+    """Returns the function ``prl.curricula.NAME`` or ``prl.tasks.NAME``.
 
     Raises:
         AttributeError: if there is no such file, with those that there are.
@@ -149,7 +149,7 @@ def recipe_function(group: Literal["task", "method"], name: str) -> Callable[...
 
 
 def filter_content(filter: Mapping[str, Any] | str) -> dict[str, Any]:
-    """What a filter sets below the keys ``filter`` and ``model``.
+    """Returns what a filter sets below the keys ``filter`` and ``model``.
 
     Args:
         filter: a name in ``conf/filter``, or settings; with any of a model's, such as ``labels``,
@@ -178,7 +178,7 @@ def _by_key(group: str, name: str) -> dict[str, dict[str, Any]]:
 
 
 def override(key: str, value: Any) -> str:
-    """A key and its value, of a function its dotted name, as an override of Hydra's.
+    """Returns a key and its value as one of Hydra's overrides; a function by its dotted name.
 
     Raises:
         ArgumentError: naming the key, as :func:`override_value`.
@@ -192,7 +192,7 @@ def override(key: str, value: Any) -> str:
 
 
 def override_value(value: Any) -> str:
-    r"""A value of Python's, NumPy's or OmegaConf's as Hydra's grammar of overrides takes it.
+    r"""Returns a value of Python, NumPy or OmegaConf in Hydra's grammar of overrides.
 
     Raises:
         ArgumentError: if it is neither a number, a text, a list nor a mapping of such.
@@ -229,7 +229,7 @@ def _key(key: Any) -> str:
 
 
 def file_content(name: str) -> dict[str, Any]:
-    """What stands in a file such as ``method/plr`` and in those that it builds on, its own last."""
+    """Returns the content of a file such as ``method/plr``, merged over those it builds on."""
     content, group = yaml_file(name), name.partition("/")[0]
     parts = []
     for default in content.pop("defaults", ()):
@@ -240,7 +240,7 @@ def file_content(name: str) -> dict[str, Any]:
 
 
 def merged(*settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings below some keys, those of later ones over those before; None in place of all."""
+    """Returns mappings merged key by key, later ones first; None replaces a whole mapping."""
     found: dict[str, Any] = {}
     for some in settings:
         for key, value in some.items():
@@ -250,7 +250,7 @@ def merged(*settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def resolved(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a file, with what they refer to in ``train.yaml`` in its place."""
+    """Returns the settings of a file, with references to ``train.yaml`` resolved."""
     train, found = yaml_file("train"), dict(settings)
     for name, value in settings.items():
         reference = REFERENCE.fullmatch(value) if isinstance(value, str) else None
@@ -260,13 +260,13 @@ def resolved(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def yaml_file(name: str) -> dict[str, Any]:
-    """What stands in a file of the configuration, named from its folder on, without ``.yaml``."""
+    """Returns the content of a configuration file, named from its folder on without ``.yaml``."""
     content = yaml.safe_load((CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
     return content or {}
 
 
 def comments(file: Path) -> Iterator[str]:
-    """The lines of a configuration file that begin with a #, but for the one that Hydra reads."""
+    """Yields the lines of a file that begin with a #, without the one that Hydra reads."""
     # What is no UTF-8 is refused where it is used.
     for line in file.read_text(encoding="utf-8-sig", errors="replace").splitlines():
         if line.startswith("#") and not line.startswith("# @package"):

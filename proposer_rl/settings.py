@@ -31,7 +31,7 @@ T = TypeVar("T")
 P = ParamSpec("P")
 
 Count = Annotated[int, Interval(ge=1, le=1_000_000)]
-"""Of what is counted, at least one: more than a million would not fit, or never come to pass."""
+"""A count from 1 to a million; a larger one is most likely a typing error."""
 Share = Annotated[float, Interval(ge=0, le=1)]
 """A part of a whole, or a probability."""
 Decay = Annotated[float, Interval(ge=0, lt=1)]
@@ -45,7 +45,7 @@ NotNegative = Annotated[float, Ge(0)]
 SHOULD = "input should be "  # as pydantic begins most of its lines
 
 BY_KIND = Discriminator("kind")
-"""Of a union of settings, each of which has an entry ``kind`` of its own."""
+"""Tells the members of a union of settings apart, by the entry ``kind`` of each."""
 
 
 class ArgumentError(ValueError):
@@ -57,7 +57,7 @@ class ArgumentError(ValueError):
 
 
 def checked(function: Callable[P, T]) -> Callable[P, T]:
-    """Hold every call of a function to its signature; of a class, decorate ``__init__``.
+    """Holds every call of a function to its signature; of a class, decorate ``__init__``.
 
     What may be given stands in the annotations alone: ``step: Positive``,
     ``source: Literal["exact", "episodes"]``, ``every: Annotated[int, Interval(ge=1, le=100)]``.
@@ -88,7 +88,7 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def signed(made: type[T]) -> type[T]:
-    """Show a class's constructor as its signature, which TorchRL's metaclass of environments hides.
+    """Gives a class its constructor's signature, which TorchRL's metaclass of environments hides.
 
     Example:
         >>> from torchrl.envs import EnvBase
@@ -109,7 +109,7 @@ def arguments(
     given: Collection[str] = (),
     others: Collection[str] = (),
 ) -> dict[str, Any]:
-    """Check arguments against the signature of what will be called with them.
+    """Checks arguments against the signature of what will be called with them.
 
     Numbers are read strictly (true is no number, "3" is none, 1.0 no integer), infinity and NaN are
     refused, a list may stand for a tuple and a mapping for settings. Other libraries' numbers,
@@ -151,7 +151,7 @@ def check_names(
     missing: bool = True,
     others: Collection[str] = (),
 ) -> None:
-    """Refuse unknown names, and if asked those that are missing; see :func:`arguments`."""
+    """Refuses unknown names, and if asked missing ones; see :func:`arguments`."""
     parameters = inspect.signature(function).parameters.values()
     named = [p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
     known = [*others, *(p.name for p in named if p.name not in ("self", *given))]
@@ -185,7 +185,7 @@ def _adapters(function: Callable[..., Any]) -> dict[str, TypeAdapter[Any] | None
 
 
 def _adapter(hint: Any) -> TypeAdapter[Any] | None:
-    """What reads values of a type; None for any, or one that pydantic knows nothing of."""
+    """Returns what reads values of a type; None for any, or one unknown to pydantic."""
     if hint in (Any, object):
         return None
     for config in (ConfigDict(allow_inf_nan=False), None):  # a dataclass has its own
@@ -272,7 +272,7 @@ def _first_line(error: ValidationError, name: str, value: Any) -> str:
 
 
 def _place(details: Any, value: Any) -> tuple[list[int | str], Any]:
-    """Where in a value something is wrong, and the innermost container around that place."""
+    """Returns where in a value something is wrong, and the innermost container around it."""
     loc: list[int | str] = []
     folder = inner = value
     for part in details["loc"]:
@@ -287,7 +287,7 @@ def _place(details: Any, value: Any) -> tuple[list[int | str], Any]:
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def settings(cls: type[T]) -> type[T]:
-    """A frozen, keyword-only dataclass whose constructor is :func:`checked`.
+    """Makes a frozen, keyword-only dataclass whose constructor is :func:`checked`.
 
     Ranges stand in the annotations (``Annotated[int, Ge(1)]``).
     """

@@ -39,11 +39,11 @@ class Streams:
         return [self._seed, *self._scope]
 
     def within(self, *scope: str | int) -> Streams:
-        """The streams below a further scope."""
+        """Returns the streams below a further scope."""
         return Streams(self._seed, *self._scope, *scope)
 
     def generator(self, *key: str | int) -> torch.Generator:
-        """A fresh generator on the CPU for ``key``; equal keys give generators in equal states.
+        """Returns a new CPU generator for ``key``; equal keys give equal states.
 
         Numbers are drawn there for every device: generators of other devices draw others.
         """
@@ -51,7 +51,7 @@ class Streams:
 
     @contextmanager
     def as_default(self, *key: str | int) -> Iterator[None]:
-        """Let torch's default generator on the CPU draw from ``key`` inside the context only.
+        """Lets torch's default CPU generator draw from ``key`` inside the context only.
 
         For code that takes no generator, such as the initialisation of layers.
         """
@@ -67,5 +67,5 @@ class Streams:
 
 
 def _own(key: str | int) -> str | int:
-    """A key as Python's own, which has another representation than NumPy's."""
+    """Returns a key as Python's own, since NumPy's has another representation."""
     return str(key) if isinstance(key, str) else index(key)

@@ -27,7 +27,7 @@ from proposer_rl.task import ComputeContext, Task
 
 
 class Made(NamedTuple):
-    """What an experiment is made of."""
+    """The task, the Solvers and the curriculum of an experiment."""
 
     task: Task
     learner: PPO
@@ -35,7 +35,7 @@ class Made(NamedTuple):
 
 
 def parts(config: RunConfig, signals: StopSignals, status: Status | None = None) -> Made:
-    """Task, Solvers and curriculum of an experiment; nothing is written yet."""
+    """Makes task, Solvers and curriculum of an experiment; nothing is written yet."""
     require_logger(config.logger)
     task = make_task(config)
     with key("solver.ppo"):
@@ -57,7 +57,7 @@ def build(
     status: Status | None = None,
     log: Log | None = None,
 ) -> Experiment:
-    """Put an experiment together of the parts that :func:`parts` has made."""
+    """Returns the experiment of the parts that :func:`parts` has made."""
     return Experiment(
         *made,
         schedule=config.schedule,
@@ -71,7 +71,7 @@ def build(
 
 
 def make_task(config: RunConfig) -> Task:
-    """The task of a run, on its device and with its number of threads."""
+    """Returns the task of a run, on its device and with its number of threads."""
     compute = config.compute
     device = _device(compute.device)
     if compute.threads is not None:
@@ -96,7 +96,7 @@ def make_task(config: RunConfig) -> Task:
 
 
 def _check_memory(learner: PPO) -> None:
-    """Refuse a rollout that no memory holds: it is collected step by step, until that is full."""
+    """Refuses a rollout that exceeds the memory, which would fill it step by step."""
     levels = learner.agent.level_keys  # of which there is one for all steps
     step = learner.env.fake_tensordict().exclude(*levels, *(("next", name) for name in levels))
     taken, device = step.bytes() * learner.horizon, learner.env.device
@@ -111,7 +111,7 @@ def _check_memory(learner: PPO) -> None:
 
 
 def _made(maker: partial[Any], solver: SolverSettings, context: ComputeContext, device: str) -> Any:
-    """The task on a device; a worker calls it, too."""
+    """Returns the task on a device; workers call it, too."""
     use_device(torch.device(device))
     with own_state():  # also after whatever a module of one's own sets as it is imported
         return maker(solver=solver, context=context._replace(device=torch.device(device)))
@@ -169,7 +169,7 @@ def _check_cycle(config: RunConfig) -> None:
 
 
 def _workers(config: RunConfig, task: Task) -> Workers | None:
-    """Where the replicas are trained; None for this process."""
+    """Returns where the replicas are trained; None for this process."""
     compute, copies = config.compute, config.proposer.rollouts
     if compute.collector == "single":
         for name in ("workers", "worker_devices"):

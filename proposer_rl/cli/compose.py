@@ -29,7 +29,7 @@ from proposer_rl.runs.process import StopSignals
 
 
 def compose_and_run(overrides: Sequence[str], own: Mapping[str, Any], folder: Path | None) -> Path:
-    """Train as ``bin/train`` with these overrides does.
+    """Trains as ``bin/train`` with these overrides does.
 
     Args:
         overrides: as on the command line.
@@ -56,7 +56,7 @@ def compose_and_run(overrides: Sequence[str], own: Mapping[str, Any], folder: Pa
 
 @contextmanager
 def _folder(given: Path | None, config: DictConfig) -> Iterator[Path]:
-    """The run's folder: a new one that no other run has, of which a refused run leaves nothing."""
+    """Yields the run's folder; a new one is removed again if the run is refused."""
     if given is not None:
         yield given
         return
@@ -78,7 +78,7 @@ def _folder(given: Path | None, config: DictConfig) -> Iterator[Path]:
 
 @contextmanager
 def _composed(overrides: Sequence[str]) -> Iterator[DictConfig]:
-    """The configuration, which Hydra's globals hold meanwhile; a Hydra around us gets them back."""
+    """Yields the configuration, with Hydra's globals set for it and restored afterwards."""
     before = Singleton.get_state()
     GlobalHydra.instance().clear()
     try:

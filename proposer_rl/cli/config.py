@@ -38,7 +38,7 @@ CANNOT_BE_CALLED = (ValueError, TypeError, NameError)
 def key(
     name: str, other: str = "", kinds: tuple[type[Exception], ...] = (ValueError,)
 ) -> Iterator[None]:
-    """Put a key of the configuration before what is said of the arguments that stand below it.
+    """Prefixes errors on arguments with the key of the configuration that they stand below.
 
     Args:
         name: the key.
@@ -69,7 +69,7 @@ class HandDesignedSettings:
 
 @settings
 class PoolSettings:
-    """How many levels curricula keep, and choose among.
+    """Settings of curricula that keep levels: how many, and among how many they choose.
 
     Attributes:
         capacity: levels of a buffer.
@@ -86,7 +86,7 @@ class PoolSettings:
 
 @settings
 class LoggerSettings:
-    """Where rows of metrics go besides the run's folder.
+    """Settings of the logger that gets rows of metrics besides the run's folder.
 
     Attributes:
         type: ``csv`` for nowhere.
@@ -101,7 +101,7 @@ class LoggerSettings:
 
 @settings
 class ComputeSettings:
-    """Where and how a run is computed, which changes no numbers beyond rounding.
+    """Settings of where a run is computed, which change no numbers beyond rounding.
 
     Attributes:
         device: ``auto``: cuda where there is one, else cpu.
@@ -156,7 +156,7 @@ class RunConfig:
 
 
 def read_config(config: DictConfig) -> RunConfig:
-    """Check a composed configuration."""
+    """Checks a composed configuration and returns it as settings."""
     if isinstance(config.task, DictConfig) and "_target_" not in config.task:
         raise ConfigError(
             "task._target_: missing: the class that makes the task; a file of one's own has it "
@@ -181,7 +181,7 @@ def read_config(config: DictConfig) -> RunConfig:
 
 
 def task_maker(values: Mapping[str, Any]) -> partial[Any]:
-    """What makes the task of these settings, given ``solver`` and ``context``."""
+    """Returns a function that makes the task of these settings from ``solver`` and ``context``."""
     target = f"task._target_={values.get('_target_')}"
     make, own = located("task", values)
     for missing in set(GIVEN_TO_TASKS) - {*inspect.signature(make).parameters}:
@@ -206,13 +206,13 @@ def located(name: str, values: Mapping[str, Any]) -> tuple[Callable[..., Any], d
 
 
 def saved_config(folder: Path) -> RunConfig:
-    """The settings of the run in a folder; where it is computed is left to choice."""
+    """Returns the settings of the run in a folder; where it is computed is left to choice."""
     file = settings_file(folder)
     return checked_config(stored_config(file), file)
 
 
 def checked_config(values: Mapping[str, Any], file: Path) -> RunConfig:
-    """Settings as a run stored them; where it is computed is left to choice."""
+    """Returns settings as a run stored them; where it is computed is left to choice."""
     free = {"compute": {"threads": 1, "progress": False}, "logger": {"type": "csv"}}
     try:
         return _checked({**values, **free})
@@ -223,7 +223,7 @@ def checked_config(values: Mapping[str, Any], file: Path) -> RunConfig:
 
 
 def stored_config(file: Path) -> Any:
-    """The settings in a run's ``config.json`` as they stand there, of which nothing is made."""
+    """Returns the content of a run's ``config.json`` unchecked."""
     try:
         return json.loads(read_bounded(file, LARGEST_FILE))
     except (ValueError, RecursionError):
@@ -231,7 +231,7 @@ def stored_config(file: Path) -> Any:
 
 
 def _why_not_found(error: BaseException) -> str:
-    """One line on a ``_target_`` that cannot be had; of an import that fails, why it does."""
+    """Returns one line on why a ``_target_`` cannot be imported."""
     line = re.split(r", set env var HYDRA_FULL_ERROR|\s*full_key: ", one_line(error))[0]
     innermost = error
     while innermost.__cause__ is not None:
@@ -246,7 +246,7 @@ def _why_not_found(error: BaseException) -> str:
 
 
 def _resolved(config: DictConfig) -> Any:
-    """Plain values, with what they refer to put in its place."""
+    """Returns plain values, with references replaced by what they refer to."""
     try:
         return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
@@ -263,7 +263,7 @@ def _checked(values: Mapping[str, Any]) -> RunConfig:
 
 
 def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Every value that is no mapping or list, with its dotted key."""
+    """Yields every value that is no mapping or list, with its dotted key."""
     if isinstance(value, dict | list):
         for part, inner in value.items() if isinstance(value, dict) else enumerate(value):
             if isinstance(part, bool):

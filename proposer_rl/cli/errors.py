@@ -32,7 +32,7 @@ class ConfigError(ValueError):
 
 
 def command(body: Callable[[], None]) -> None:
-    """Run the body of a command; what was foreseen ends it with one line and its exit code."""
+    """Runs the body of a command; a foreseen error ends it with one line and its exit code."""
     print_all_signs()
     try:
         body()
@@ -45,13 +45,13 @@ def command(body: Callable[[], None]) -> None:
 
 
 def print_all_signs() -> None:
-    """Let a question mark stand on standard output for what its encoding does not have."""
+    """Makes standard output print ``?`` for characters that its encoding does not have."""
     if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="replace")
 
 
 def say(text: str) -> None:
-    """Print a text on standard output, which may be a user's own: in signs that it has."""
+    """Prints a text on standard output, with ``?`` for characters that its encoding lacks."""
     from tqdm import tqdm
 
     encoding = sys.stdout.encoding or "utf-8"
@@ -59,13 +59,13 @@ def say(text: str) -> None:
 
 
 def refuse(error: Exception, folder: Path | None = None) -> NoReturn:
-    """Say in one line what is wrong, as :func:`one_line` does, and exit."""
+    """Prints an error in one line, as :func:`one_line` does, and exits with its code."""
     print(f"error: {one_line(error, folder)}", file=sys.stderr)
     sys.exit(exit_code(error))
 
 
 def exit_code(error: BaseException) -> int:
-    """The exit code that an error stands for."""
+    """Returns the exit code of an error."""
     if lacks_memory(error):
         return BAD_INPUT
     storage = STORAGE if isinstance(error, OSError) else UNFORESEEN
@@ -73,14 +73,14 @@ def exit_code(error: BaseException) -> int:
 
 
 def lacks_memory(error: BaseException) -> bool:
-    """Whether there was not as much memory as was asked for, on the CPU or a GPU."""
+    """Returns whether an error means that memory was exhausted, on the CPU or a GPU."""
     # No word that a defect might use, too: that must keep its traceback.
     torchs = isinstance(error, RuntimeError) and "tried to allocate" in str(error).lower()
     return torchs or isinstance(error, MemoryError)
 
 
 def one_line(error: BaseException, folder: Path | None = None) -> str:
-    """An error's message without line breaks and other control characters.
+    """Returns an error's message without line breaks and other control characters.
 
     Args:
         error: what has happened.
@@ -97,7 +97,7 @@ def one_line(error: BaseException, folder: Path | None = None) -> str:
 def number(
     kind: Callable[[str], Number], least: float = -math.inf, most: float = math.inf
 ) -> Callable[[str], Number]:
-    """The type of an argument that is a finite number in a range, for argparse."""
+    """Returns a type for argparse: a finite number in a range."""
     allowed = "a whole number" if kind is int else "a number"
     if math.isfinite(most):
         allowed += f" from {least:,} to {most:,}"
@@ -115,7 +115,7 @@ def number(
 
 
 def check_file(option: str, file: Path | None, *suffixes: str) -> None:
-    """Refuse a file that an option asks to be written, before anything is computed."""
+    """Refuses an output file of an unknown kind or in a missing folder, before any work."""
     if file is not None and file.suffix not in suffixes:
         raise ConfigError(f"--{option} {file}: must end in {' or '.join(suffixes)}")
     if file is not None and not file.parent.is_dir():
@@ -123,7 +123,7 @@ def check_file(option: str, file: Path | None, *suffixes: str) -> None:
 
 
 def settings_file(folder: Path) -> Path:
-    """The file of settings in a run's folder; a folder without one is no run's."""
+    """Returns the path of a run's ``config.json``; refuses a folder without one."""
     file = folder / "config.json"
     if not file.is_file():
         raise ConfigError(f"{folder}: is no run's folder: it has no config.json")

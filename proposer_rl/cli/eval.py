@@ -13,7 +13,7 @@ MOST_STEPS = 10**5
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
+    """Runs the command; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
     command(partial(_run, _parser().parse_args(arguments)))
 
 

@@ -34,7 +34,7 @@ class Evaluation(NamedTuple):
     results: Sequence[LevelResult]
 
     def rows(self) -> list[dict[str, Any]]:
-        """One mapping for each level and Solver, for JSON and CSV."""
+        """Returns a mapping for each level and Solver, for JSON and CSV."""
         return [
             {
                 "run": self.run.folder.name,
@@ -49,7 +49,7 @@ class Evaluation(NamedTuple):
 
 
 def list_levels(options: argparse.Namespace) -> None:
-    """Evaluate one run, print its levels one by one, and write what was asked for."""
+    """Evaluates one run, prints its levels one by one, and writes the files asked for."""
     evaluation = evaluate(load(options.checkpoint), options.levels, options.max_steps)
     _print(evaluation)
     if options.output is not None and options.output.suffix == ".csv":
@@ -63,7 +63,7 @@ def list_levels(options: argparse.Namespace) -> None:
 
 
 def load(checkpoint: Path) -> tuple[StoredRun, Stage]:
-    """The Solvers of a run's newest checkpoint, or of the one that is given."""
+    """Returns the Solvers of a run's newest checkpoint, or of the one that is given."""
     run = stored_run(checkpoint)
     return run, run.stage(checkpoint if checkpoint.is_file() else None)
 
@@ -72,7 +72,7 @@ def load(checkpoint: Path) -> tuple[StoredRun, Stage]:
 def evaluate(
     loaded: tuple[StoredRun, Stage], name: str | None, max_steps: int | None = None
 ) -> Evaluation:
-    """Evaluate Solvers on a set of levels.
+    """Evaluates Solvers on a set of levels.
 
     Args:
         loaded: as :func:`load` returns them.
@@ -107,7 +107,7 @@ def _print(evaluation: Evaluation) -> None:
 
 
 def _hardest(results: Sequence[LevelResult]) -> list[list[LevelResult]]:
-    """Results by level: all of a few; of many those with the least success, or return.
+    """Returns results by level: of many levels those with the least success, or return.
 
     It is the mean over the Solvers that counts; levels stay in their order.
     """
@@ -127,7 +127,7 @@ def _means(results: Sequence[LevelResult]) -> list[str]:
 
 
 def _sheet(evaluation: Evaluation) -> bytes:
-    """Pictures of the first Solver on the hardest levels side by side, a PNG file."""
+    """Returns pictures of the first Solver on the hardest levels side by side, a PNG file."""
     shown = _hardest([each for each in evaluation.results if each.solver == 0])
     columns = min(COLUMNS, len(shown))
     rows = -(-len(shown) // columns)

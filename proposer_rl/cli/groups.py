@@ -43,13 +43,13 @@ OmegaConf.register_new_resolver(
 
 
 def overrides() -> list[str]:
-    """Returns them as given on the command line: what they refer to is the run's, not Hydra's."""
+    """Returns the overrides of the command line, with the run's interpolations unresolved."""
     given: Any = OmegaConf.to_container(HydraConfig.get().overrides.task)
     return list(given)
 
 
 def check_groups(given: Sequence[str]) -> None:
-    """Refuse groups of which one would undo another, since later ones win, or that do not fit."""
+    """Refuses groups that would undo each other, since later ones win, or that do not fit."""
     said = dict(override.split("=", 1) for override in given if "=" in override)
     task, scale = said.get("task"), said.get("+scale")
     if task in available("task") and scale in available("scale"):
@@ -69,7 +69,7 @@ def check_groups(given: Sequence[str]) -> None:
 
 
 def check_chosen(config: DictConfig) -> None:
-    """Refuse to run without a method, or with a file that Hydra has put below its group.
+    """Refuses a run without a method, and a file that Hydra has put below its group.
 
     It does so with a file of one's own for want of its first line.
     """
@@ -92,7 +92,7 @@ def check_chosen(config: DictConfig) -> None:
 
 
 def explained(error: Exception) -> str:
-    """The message of an error from composing a configuration."""
+    """Returns one line on an error from composing a configuration."""
     if isinstance(error, UnicodeDecodeError):
         return _not_utf8(error)
     if isinstance(error, MissingConfigException):
@@ -118,14 +118,14 @@ def explained(error: Exception) -> str:
 
 
 def unquoted(place: str, read: object) -> str:
-    """Of a name that YAML takes for one of its constants."""
+    """Returns one line on a name that YAML takes for one of its constants."""
     words = {True: "on, yes or true", False: "off, no or false", None: "null or ~"}
     name = f"{words[read]} without quotes" if read in words else repr(read)
     return f'{place}: {name} is no name here; a name has quotes, as in "on":'
 
 
 def _no_mapping(error: Exception) -> str:
-    """Says where the list is: an error in an override names all, one in a file only the file."""
+    """Returns one line that says where the list is that should be a mapping."""
     said, *_ = str(error).splitlines()
     name, *_ = said.removeprefix("Error merging override ").split(": Config")
     name = name.removeprefix("In '").removesuffix("'")
@@ -145,7 +145,7 @@ def _lists(node: Any, place: str = "") -> Iterator[str]:
 
 
 def _not_utf8(error: UnicodeDecodeError) -> str:
-    """Names the file that was read, which is in one of the folders that the command names."""
+    """Returns one line that names the file, searched in the folders that the command names."""
     files = (file for folder in own_folders(sys.argv) for file in sorted(folder.rglob("*.yaml")))
     named = [f"{file}: " for file in files if file.read_bytes().startswith(error.object)]
     return f"{''.join(named[:1])}is not encoded in UTF-8; save it so ({one_line(error)})"

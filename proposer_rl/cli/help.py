@@ -35,7 +35,7 @@ NEEDS, NOTHING = "Needs: ", "nothing."
 
 
 def help_text(arguments: Sequence[str]) -> str:
-    """Usage, what each group has, also in a folder given with ``--config-dir``, and examples."""
+    """Returns usage, the choices of each group, also of ``--config-dir``, and examples."""
     folders = [CONFIG_FOLDER, *own_folders(arguments)]
     parts = [USAGE]
     for option, meaning in GROUPS.items():
@@ -47,7 +47,7 @@ def help_text(arguments: Sequence[str]) -> str:
 
 
 def choices(group: str, folders: Sequence[Path]) -> dict[str, str]:
-    """What a group has, by name, each with its file's first line.
+    """Returns the choices of a group by name, each with the first line of its file.
 
     Args:
         group: such as ``method``.
@@ -62,7 +62,7 @@ def choices(group: str, folders: Sequence[Path]) -> dict[str, str]:
 
 
 def needs(folders: Sequence[Path]) -> dict[str, list[str]]:
-    """What methods need, by name, where their files have a line ``# Needs:``."""
+    """Returns what methods need, by name, where their files have a line ``# Needs:``."""
     found: dict[str, list[str]] = {}
     for folder in folders:
         for name in available("method", folder):
@@ -75,7 +75,7 @@ def needs(folders: Sequence[Path]) -> dict[str, list[str]]:
 
 
 def own_folders(arguments: Sequence[str]) -> Iterator[Path]:
-    """Folders of configurations that a command names."""
+    """Yields the folders of configurations that a command names."""
     option = "--config-dir"
     for argument, following in zip(arguments, [*arguments, ""][1:], strict=True):
         name, equals, value = argument.partition("=")

@@ -29,7 +29,7 @@ Write = Callable[[Mapping[str, float], Mapping[str, Picture], int], None]
 
 
 def require_logger(settings: LoggerSettings) -> None:
-    """Check that a logger can be used, before anything is written."""
+    """Checks that a logger can be used, before anything is written."""
     if settings.type == "csv":
         return
     if find_spec(settings.type) is None:
@@ -51,7 +51,7 @@ def require_logger(settings: LoggerSettings) -> None:
 def logger(
     settings: LoggerSettings, path: Path, name: str, config: Mapping[str, Any]
 ) -> Iterator[Write | None]:
-    """What writes to a logger of an installed package; None where the run's folder is enough."""
+    """Yields a function that writes to a logger; None where the run's folder is enough."""
     if settings.type == "tensorboard":
         with _tensorboard(path / name, config) as write:
             yield write
@@ -63,7 +63,7 @@ def logger(
 
 
 def log_of(write: Write, last_map: Callable[[], Picture | None]) -> Log:
-    """Returns what takes rows of a run's tables, and writes what of them is a number or a picture.
+    """Returns a function that writes numbers and pictures of rows of a run's tables to a logger.
 
     Args:
         write: to a logger.
@@ -98,7 +98,7 @@ def _tensorboard(folder: Path, config: Mapping[str, Any]) -> Iterator[Write]:
 def _wandb(
     settings: LoggerSettings, path: Path, name: str, config: Mapping[str, Any]
 ) -> Iterator[Write]:
-    """What its own variables say, such as WANDB_MODE, holds where the settings say nothing."""
+    """Yields a function that writes to W&B; its variables hold where the settings say nothing."""
     import wandb
 
     try:
@@ -129,7 +129,7 @@ def _wandb(
 
 
 def wandb_id(path: Path) -> str:
-    """The id of a run at Weights & Biases, kept in its folder: one that goes on is no second."""
+    """Returns the id of a run at Weights & Biases, which a resumed run finds in its folder."""
     file = path / ID
     if not file.is_file():
         write_atomically(file, secrets.token_hex(4).encode())
@@ -143,7 +143,7 @@ def _refusal(error: Exception) -> ConfigError:
 
 
 def _numbers(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    """A row's numbers, of a list of them the maximum and the mean, and its shares of a batch."""
+    """Yields a row's numbers, maximum and mean of its lists of numbers, and its batch shares."""
     for key, value in row.items():
         if isinstance(value, int | float):
             yield key, value
@@ -157,7 +157,7 @@ def _numbers(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
 def _images(
     row: Mapping[str, Any], last_map: Callable[[], Picture | None]
 ) -> Iterator[tuple[str, Picture]]:
-    """What of a row is seen better than read."""
+    """Yields pictures of a row: its levels, and its histogram as a heat map."""
     levels = row.get("levels", ())
     for name, records in levels.items() if isinstance(levels, Mapping) else [("levels", levels)]:
         found = [picture(record.get("picture")) for record in records]
@@ -171,7 +171,7 @@ def _images(
 
 
 def _sheet(tiles: Sequence[Picture]) -> Picture:
-    """Pictures side by side on white, four in a row."""
+    """Returns pictures side by side on white, four in a row: uint8 [H, W, 3]."""
     height, width = (max(tile.shape[side] for tile in tiles) + GAP for side in (0, 1))
     rows = -(-len(tiles) // COLUMNS)
     sheet = np.full((rows * height, min(len(tiles), COLUMNS) * width, 3), 255, np.uint8)

@@ -29,7 +29,7 @@ another."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point; Ctrl-C ends it well, else the exit codes are those of ``cli/errors.py``."""
+    """Runs the command until Ctrl-C; other exit codes are those of ``cli/errors.py``."""
     command(partial(_run, _parser().parse_args(arguments)))
 
 
@@ -58,7 +58,7 @@ def _run(options: argparse.Namespace) -> None:
 
 
 def open_session(folder: Path) -> Session:
-    """What there is to see of the run in a folder."""
+    """Returns the session that shows the run in a folder."""
     settings_file(folder)  # before what takes seconds to import
     from proposer_rl.cli.config import saved_config
     from proposer_rl.cli.run import run_name

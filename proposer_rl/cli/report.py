@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from proposer_rl.cli.errors import command, number
+from proposer_rl.cli.errors import ConfigError, command, number
 from proposer_rl.cli.help import choices
 from proposer_rl.recipes import CONFIG_FOLDER
 
@@ -27,7 +27,7 @@ the finished ones are named; they are in the figures as far as they got, not in 
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
+    """Runs the command; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
     command(partial(_run, _parser().parse_args(arguments)))
 
 
@@ -35,7 +35,12 @@ def _run(options: argparse.Namespace) -> None:
     from proposer_rl.report.reading import find_runs
     from proposer_rl.runs.records import printable
 
-    if all(path.suffix == ".jsonl" for path in options.folder):
+    logs = [path for path in options.folder if path.suffix == ".jsonl"]
+    if logs:
+        if len(logs) < len(options.folder) or options.threshold is not None or options.baseline:
+            raise ConfigError(
+                f"{logs[0]}: is a teacher's log, reported without runs, --threshold and --baseline"
+            )
         from proposer_rl.report.teachers import write_teachers
 
         print(printable(f"Report: {write_teachers(options.folder, options.output)}"))

@@ -48,7 +48,7 @@ FALLING = "solver.ppo.anneal_updates"
 
 
 class Shown(Protocol):
-    """What people see of a run's folder; :mod:`proposer_rl.cli.shown` is it."""
+    """The interface of :mod:`proposer_rl.cli.shown`, which draws and prints a run's results."""
 
     def draw_run(self, folder: Path, title: str) -> Path:
         """Draws the picture of a run that is over; returns its file."""
@@ -68,7 +68,7 @@ class Shown(Protocol):
 
 
 def train(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> float:
-    """Carry a run out for the command line: where it is stopped, say how it goes on, and end.
+    """Carries out a run for the command line; where it is stopped, says how it goes on, and exits.
 
     Returns:
         The headline measurement at the end, e.g. for a Hydra sweeper.
@@ -89,7 +89,7 @@ def train(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> 
 
 @own_state()
 def carry_out(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> float:
-    """Make the parts of an experiment, and run it in a folder that nobody else uses meanwhile.
+    """Makes the parts of an experiment, and runs it in a folder that it locks meanwhile.
 
     It is called inside the context of the signals that may ask the run to stop.
 
@@ -121,7 +121,7 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals, shown: Shown)
 def proceed(
     config: RunConfig, made: Made, path: Path, signals: StopSignals, status: Status, shown: Shown
 ) -> dict[str, Any]:
-    """Begin a run, go on with it, or say that it is finished; returns its summary."""
+    """Begins a run, resumes it, or says that it is finished; returns its summary."""
     folder = RunFolder(path)
     # What `auto` has become, so that a run goes on in the same precision elsewhere.
     precision: Any = made.task.precision
@@ -158,7 +158,7 @@ def proceed(
 
 
 def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
-    """The summary of a run that is already at the end of a schedule of so many updates.
+    """Returns the summary of a run that is already at the end of a schedule; else None.
 
     One that goes on to a longer schedule has none until it ends again.
     """
@@ -189,7 +189,7 @@ def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
 
 
 def check_same_run(folder: RunFolder, config: RunConfig) -> None:
-    """Refuse to go on with a run that was started with other settings.
+    """Refuses to go on with a run that was started with other settings.
 
     The stored configuration is compared with the present one and used for nothing else. If there is
     none, the present one is written.
@@ -229,7 +229,7 @@ def check_same_run(folder: RunFolder, config: RunConfig) -> None:
 
 
 def as_begun(config: RunConfig, path: Path) -> RunConfig:
-    """The settings, with what ``precision=auto`` was on the machine where the run was begun."""
+    """Returns the settings with the precision that ``auto`` meant where the run was begun."""
     file = path / "config.json"
     if config.precision != "auto" or not file.is_file():
         return config
@@ -240,7 +240,7 @@ def as_begun(config: RunConfig, path: Path) -> RunConfig:
 
 
 def _different(before: Any, now: Any, prefix: str = "") -> dict[str, tuple[Any, Any]]:
-    """Both values of every key that differs, by its dotted name."""
+    """Returns both values of every key that differs, by its dotted name."""
     if not (isinstance(before, dict) and isinstance(now, dict)):
         return {} if before == now else {prefix.rstrip("."): (before, now)}
     return {
@@ -251,13 +251,13 @@ def _different(before: Any, now: Any, prefix: str = "") -> dict[str, tuple[Any, 
 
 
 def run_name(config: RunConfig) -> str:
-    """The run's name, in pictures and loggers."""
+    """Returns the run's name, for pictures and loggers."""
     ablation = "" if config.ablation == "none" else f"_{config.ablation}"
     return f"{config.method}{ablation}_seed_{'-'.join(map(str, config.seeds))}"
 
 
 def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
-    """What the run is, and what it is made with: method, seeds, machine, versions."""
+    """Returns what the run is, and what it is made with: method, seeds, machine, versions."""
     device = experiment.task.device
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else ""
     packages = ("proposer_rl", "torchrl", "tensordict", "hydra-core")
@@ -286,7 +286,7 @@ def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
 
 
 def to_go_on(path: Path) -> str:
-    """The command that goes on with the run in a folder."""
+    """Returns the command that resumes the run in a folder."""
     paths, config = _python_path(), _config_folder()
     before = [f"PYTHONPATH={shlex.quote(paths)}"] if paths else []
     options = ["--config-dir", config] if config else []
@@ -296,7 +296,7 @@ def to_go_on(path: Path) -> str:
 
 
 def quoted(path: str) -> str:
-    """A path as Hydra's grammar of overrides takes it: in its quotes, where it has to be."""
+    """Returns a path as Hydra's grammar of overrides takes it, in quotes where it needs them."""
     with suppress(HydraException):
         if OverridesParser.create().parse_override(f"hydra.run.dir={path}").value() == path:
             return path
@@ -304,7 +304,7 @@ def quoted(path: str) -> str:
 
 
 def _about(config: RunConfig) -> dict[str, str]:
-    """What method and ablation do, in the words of their files; those of one's own, too."""
+    """Returns what method and ablation do, by the first lines of their files."""
     own = _config_folder()
     folders = [CONFIG_FOLDER, *([Path(own)] if own else [])]
     chosen = {"method": config.method, "ablation": config.ablation}
@@ -314,21 +314,21 @@ def _about(config: RunConfig) -> dict[str, str]:
 
 
 def _config_folder() -> str | None:
-    """The folder given with ``--config-dir``."""
+    """Returns the folder given with ``--config-dir``; None without."""
     sources = HydraConfig.get().runtime.config_sources
     given = (source.path for source in sources if source.provider == "command-line")
     return next(map(_from_here, given), None)
 
 
 def _python_path() -> str | None:
-    """The caller's PYTHONPATH: that of this process without the checkout, which bin/ adds."""
+    """Returns the caller's PYTHONPATH without the checkout, which bin/ adds."""
     own = str(PACKAGE.parent)
     given = [part for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part]
     return os.pathsep.join(_from_here(part) for part in given if part != own) or None
 
 
 def _from_here(path: str) -> str:
-    """A path as it can be given again on another machine: from the working folder, if inside it."""
+    """Returns a path relative to the working folder if it lies inside, else unchanged."""
     inside = Path(path).resolve()
     here = Path.cwd().resolve()
     return str(inside.relative_to(here)) if inside.is_relative_to(here) else path

@@ -35,11 +35,11 @@ class SweepSummary(Callback):
         self._failed_before: dict[Path, int] = {}
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Called by Hydra before the first run."""
+        """Notes earlier failures in the sweep's folder, before the first run."""
         self._failed_before = _failures(config)
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        """Called by Hydra after the last run, whatever became of the runs."""
+        """Prints the sweep's runs, and exits with a failed one's code."""
         found = find_progress(Path(config.hydra.sweep.dir))
         Console().print(overview(found))
         failed = _failures(config).items() - self._failed_before.items()
@@ -65,7 +65,7 @@ def last_map(folder: Path) -> NDArray[np.uint8] | None:
 def announce(
     method: str, seeds: Sequence[int], result: Mapping[str, Any], folder: Path, picture: Path
 ) -> None:
-    """Print the results; on one screen, unless the run is one of a sweep's."""
+    """Prints the results; with a screen of the run, unless it is part of a sweep."""
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         console = Console()
         with console.capture() as printed:
@@ -102,6 +102,6 @@ def _cost_text(result: Mapping[str, Any], seeds: int) -> str:
 
 
 def _failures(config: DictConfig) -> dict[Path, int]:
-    """What is recorded of failed runs in a sweep's folder, and when it was written."""
+    """Returns the files that record failed runs in a sweep's folder, with their times."""
     folder = Path(config.hydra.sweep.dir)
     return {file: file.stat().st_mtime_ns for file in folder.rglob(FAILURE)}

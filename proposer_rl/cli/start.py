@@ -10,7 +10,7 @@ from proposer_rl.cli.help import help_text
 
 
 def main() -> None:
-    """Entry point of the command."""
+    """Prints the help, or runs the command."""
     if {"--help", "-h"} & set(sys.argv[1:]):
         print_all_signs()
         try:

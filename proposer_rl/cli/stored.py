@@ -48,7 +48,7 @@ class StoredRun(NamedTuple):
 
     @own_state()
     def stage(self, file: Path | None = None) -> Stage:
-        """The Solvers in one of the files; None for the newest that is intact."""
+        """Returns the Solvers in one of the files; None stands for the newest intact one."""
         found = load_latest(self.files[-1].parent) if file is None else load_checkpoint(file)
         assert found is not None, "there is a checkpoint"
         step, state = found
@@ -64,7 +64,7 @@ class StoredRun(NamedTuple):
 
 @own_state()
 def stored_run(path: Path) -> StoredRun:
-    """A run that has checkpoints.
+    """Returns a run that has checkpoints.
 
     Args:
         path: the folder, or one of its checkpoints, which is the only file then.
@@ -81,6 +81,6 @@ def stored_run(path: Path) -> StoredRun:
 
 
 def write_rows(rows: Sequence[Any], file: Path | None) -> None:
-    """Write rows as JSON, if a file is given."""
+    """Writes rows as JSON, if a file is given."""
     if file is not None:
         write_atomically(file, (json.dumps(rows, indent=1) + "\n").encode())

@@ -23,7 +23,7 @@ examples:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point; Ctrl-C ends it well, else the exit codes are those of ``cli/errors.py``."""
+    """Runs the command until Ctrl-C; other exit codes are those of ``cli/errors.py``."""
     command(partial(_run, _parser().parse_args(arguments)))
 
 
@@ -41,7 +41,7 @@ def _run(options: argparse.Namespace) -> None:
 
 
 def draw(folder: Path) -> RenderableType:
-    """The folder's run as a screen, or its runs as a table."""
+    """Returns the folder's run as a screen, or its runs as a table."""
     found = find_progress(folder)
     return screen(found[0]) if len(found) == 1 else overview(found)
 

@@ -66,7 +66,7 @@ from proposer_rl.recipes import Recipe, available, own_recipe, recipe_function
 
 
 def own(make: Callable[..., Any], **settings: Any) -> Recipe:
-    """A curriculum of one's own: see :func:`proposer_rl.recipes.own_recipe`."""
+    """Returns the recipe of a curriculum of one's own: :func:`proposer_rl.recipes.own_recipe`."""
     return own_recipe("method", make, **settings)
 
 

@@ -57,7 +57,7 @@ class BinCurriculum(Curriculum):
     def evidence(
         self, student: Student, batch: Batch, outcome: TensorDictBase
     ) -> dict[str, Tensor]:
-        """Returns what is to be learnt from an outcome, tensors [K, n] by name."""
+        """Returns what :meth:`learn` needs of an outcome, tensors [K, n] by name."""
         return {}
 
     def learn(self, evidence: TensorDict) -> None:

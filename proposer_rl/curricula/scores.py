@@ -106,7 +106,7 @@ EXACT: dict[str, tuple[tuple[str, ...], Callable[[Student, Levels], Tensor]]] = 
     ),
     "gradient_norm": (("gradient_norms",), lambda s, levels: s.gradient_norms(levels)),
 }
-"""Of each score what it needs of a student, and what it is: float [K, n] of levels [K, n]."""
+"""The functions that each score needs of a student, and its formula: float [K, n]."""
 
 
 class Episodes(NamedTuple):
@@ -129,7 +129,7 @@ class Episodes(NamedTuple):
 
 
 def episodes(rollout: TensorDictBase) -> Episodes:
-    """Split a rollout [K, P, T] into its episodes."""
+    """Splits a rollout [K, P, T] into its episodes."""
     after = rollout["next"]
     done, reward = (after[key].squeeze(-1) for key in ("done", "reward"))
     ends, reward = done.long(), reward.double()
@@ -161,7 +161,7 @@ class Scored(NamedTuple):
 
 
 def unseen(shape: Sequence[int]) -> Tensor:
-    """The highest return on levels that nobody has played yet."""
+    """Returns the highest return of levels that nobody has played yet."""
     return torch.full(shape, -torch.inf)
 
 
@@ -214,7 +214,7 @@ class Scorer:
         best: Tensor,
         before: Tensor,
     ) -> Scored:
-        """Score levels [K, n] by what came of training on them.
+        """Scores levels [K, n] by the outcome of training on them.
 
         Args:
             student: whose critic and discount count.
@@ -244,7 +244,7 @@ class Scorer:
     def of_rollouts(
         self, student: Student, rollouts: Sequence[TensorDictBase], best: Tensor
     ) -> Scored:
-        """Score levels [K, n] by rollouts on them, [K, n, T] each.
+        """Scores levels [K, n] by rollouts on them, [K, n, T] each.
 
         Args:
             student: whose critic and discount count.
@@ -284,7 +284,7 @@ class Scorer:
         *purpose: str | int,
         before: Tensor | None = None,
     ) -> Scored:
-        """Score levels [K, n] that nobody trains on; the student counts what that costs.
+        """Scores levels [K, n] that nobody trains on; the student counts the cost.
 
         Args:
             student: that would be trained.
@@ -315,7 +315,7 @@ class Scorer:
     def _of_played(
         self, student: Student, played: Sequence[TensorDictBase], before: Tensor
     ) -> Scored:
-        """Score levels [K, n] by rollouts or outcomes of playing on them; see :meth:`__call__`."""
+        """Scores levels [K, n] by rollouts or outcomes on them; see :meth:`__call__`."""
         none, rollouts = unseen(before.shape), "next" in played[0].keys()
         if self._own is not None:
             outcomes = map(outcome_of, played) if rollouts else played
@@ -370,7 +370,7 @@ def _own_score(score: str | OwnScore) -> OwnScore | None:
 
 
 def _of_returns(name: str, outcome: Mapping[str, Tensor], best: Tensor, before: Tensor) -> Scored:
-    """A score of levels [K, n] from returns and success alone; see the module's text."""
+    """Returns a score of levels [K, n] from returns and success alone; see the module's text."""
     reached = outcome["return"].double()
     success = outcome.get("success", torch.zeros_like(reached)).double()
     value = before.double().where(before.isfinite(), reached)

@@ -116,7 +116,7 @@ class Experiment:
 
     @property
     def costs(self) -> dict[str, float]:
-        """What each Solver has cost so far.
+        """The costs of each Solver so far, by name.
 
         ``frames``: environment steps of its own training; ``curriculum_frames`` and
         ``evaluations``: steps, and evaluations of a policy on a level, that the curriculum asked
@@ -130,7 +130,7 @@ class Experiment:
         }
 
     def run(self) -> dict[str, Any]:
-        """Train to the end of the schedule, from the folder's newest checkpoint if it has one.
+        """Trains to the end of the schedule, from the folder's newest checkpoint if it has one.
 
         Returns:
             The summary of the run, ready for JSON.
@@ -175,7 +175,7 @@ class Experiment:
         return self.summary()
 
     def summary(self) -> dict[str, Any]:
-        """Sample efficiency and cost so far, from the metrics in the folder."""
+        """Returns sample efficiency and cost so far, from the metrics in the folder."""
         rows = read_csv(self.folder.path / "metrics.csv")
         headline, threshold = self.schedule.headline, self.schedule.threshold
         reached = {
@@ -200,7 +200,7 @@ class Experiment:
         }
 
     def _improve(self) -> None:
-        """Begin a cycle."""
+        """Begins a cycle: improves the curriculum, and logs the cycle before."""
         spent = self.student.frames
         outcome = Improvement()
         if isinstance(self.curriculum, LearnedCurriculum):
@@ -228,7 +228,7 @@ class Experiment:
                 self._restore(before)
 
     def _log_cycle(self, improved: Mapping[str, Any] | None = None) -> bool:
-        """Append the log of the cycle that has ended, and the metrics of its improvement."""
+        """Writes the log of the cycle that has ended, and metrics of its improvement."""
         metrics = {**self.curriculum.log(), **(improved or {})}
         if metrics:
             self._tables.add_cycle(self.updates, self.cycles, metrics, self.costs)
@@ -276,7 +276,7 @@ class Experiment:
         return f"{self.schedule.headline} {mean:.3f}"
 
     def _pause(self, due: bool) -> None:
-        """A safe point: save if it is due or the time has come, stop if a signal asked for it."""
+        """Saves if it is due or a signal came, and then acts on the signal."""
         limit = self.schedule.checkpoint_seconds
         late = limit is not None and time.monotonic() - self._saved >= limit
         if due or late or self._signals.pending:
@@ -343,7 +343,7 @@ class Experiment:
 
 @settings
 class ScheduleSettings:
-    """How long a run is, and what happens how often; all in Solver updates.
+    """Settings of a run's length and of what happens how often, in Solver updates.
 
     Attributes:
         updates: length of the run.
@@ -368,7 +368,7 @@ class ScheduleSettings:
 
 
 def check_headline(task: Task, schedule: ScheduleSettings) -> None:
-    """Refuse to sum runs up by what is not measured, or not reached.
+    """Refuses a headline that is not measured, and a threshold that it cannot reach.
 
     Raises:
         ArgumentError: if the headline is none of the task's metrics, or a rate that is to reach

@@ -29,12 +29,12 @@ class RunTables:
     def add_metrics(
         self, updates: int, measured: TensorDictBase, costs: Mapping[str, float]
     ) -> None:
-        """A row for every copy of what it reaches, [K], and has cost."""
+        """Writes a row for each of K Solvers: its measurements, [K], and the costs so far."""
         for seed, values in self._per_copy(measured):
             self._append("metrics.csv", updates, seed, {**costs, **values})
 
     def add_levels(self, updates: int, reached: Mapping[str, TensorDictBase]) -> None:
-        """What every copy reaches on each evaluation level, [K, E] by distribution."""
+        """Writes each Solver's results on each evaluation level, [K, E] by distribution."""
         for name, performance in reached.items():
             for copy, seed in enumerate(self._seeds):
                 values = {str(key): value[copy].tolist() for key, value in performance.items()}
@@ -44,7 +44,7 @@ class RunTables:
     def add_training(
         self, updates: int, levels: Any, rollout: TensorDictBase, metrics: TensorDictBase
     ) -> None:
-        """How an update went, [K], and samples of its levels, [K, P], for every copy."""
+        """Writes PPO's numbers [K] of an update, and a sample of its levels [K, P]."""
         trained_on = self._task.training_metrics(levels, rollout)
         for seed, values in self._per_copy(trained_on, metrics):
             self._append("training.csv", updates, seed, values)
@@ -59,7 +59,7 @@ class RunTables:
     def add_cycle(
         self, updates: int, cycle: int, metrics: Mapping[str, Any], costs: Mapping[str, float]
     ) -> None:
-        """What a curriculum logs of the cycle that has ended; of its levels, records."""
+        """Writes a curriculum's log of the cycle that has ended, with its levels recorded."""
         told = dict(metrics)
         if "levels" in told:
             shown = told["levels"].items()

@@ -64,17 +64,17 @@ class PPOSettings(LearningSettings):
         horizon: steps T collected from every environment before an update.
         continue_episodes: whether episodes go on from rollout to rollout, and a new level begins
             where one ends; otherwise every rollout begins with its levels.
-        normalize_observations: the numbers that are observed are shown without the mean of all that
-            a replica has trained on, in their standard deviations, cut off at 10 of them.
-        normalize_rewards: values have the standard deviation of the discounted return for a unit,
-            which is the same as rewards divided by it.
+        normalize_observations: whether observations are standardised by the mean and the standard
+            deviation of all that a replica has trained on, and clipped to [-10, 10].
+        normalize_rewards: whether values are in units of the standard deviation of the discounted
+            return, which is the same as dividing rewards by it.
         minibatches: equal parts of a batch, shuffled anew in each epoch, with a gradient step (and
             standardised advantages) each; 1 for the batch as it is.
         anneal_updates: the learning rate falls in equal steps, update by update, and would be zero
             after so many; None for a constant one.
         anneal_clip: whether ``clip_epsilon`` falls with the learning rate.
-        clip_value: how far a value may move from that of the rollout before its error counts as if
-            it had not come back (the larger of both errors); None for the plain squared error.
+        clip_value: the value's loss is the larger of its squared error and that of the value
+            clipped to this distance from the rollout's; None for the plain squared error.
     """
 
     horizon: Annotated[int, Ge(1)] = 25
@@ -89,7 +89,7 @@ class PPOSettings(LearningSettings):
 
 @settings
 class SolverSettings:
-    """How the Solver is trained.
+    """Settings of the Solver's training.
 
     Attributes:
         batch_size: levels P of an update.

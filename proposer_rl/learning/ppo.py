@@ -152,7 +152,7 @@ class PPO:
 
     @property
     def left(self) -> float:
-        """Returns what share of the learning rate annealing leaves in the next update."""
+        """Returns the factor, 0 to 1, by which annealing scales the next update's learning rate."""
         settings = self.settings
         if settings.anneal_updates is None:
             return 1.0

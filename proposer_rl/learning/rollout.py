@@ -183,8 +183,8 @@ def set_values(agent: ActorCritic, steps: TensorDictBase, level: TensorDictBase)
 def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDictBase) -> None:
     """Writes the values after each of the steps [*B, T], whose level has this context [*B].
 
-    With the memory that is there after each step. Where an episode goes on, that is the value
-    before the next step; an agent that reads each step for itself is not asked again for those.
+    The agent has the memory that is there after each step. Where an episode goes on, the value is
+    that before the next step; an agent that reads each step by itself does not compute it again.
     """
     after, key = steps.get("next").select(*agent.step_keys), agent.value_key
     value = steps.get(key)
@@ -208,7 +208,7 @@ def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDi
 
 
 class RolloutPolicy(TensorDictModuleBase):
-    """What a collector calls: reads the steps off the context and draws actions from noise.
+    """The collector's policy: reads steps off the context and draws actions from given noise.
 
     It carries an agent's memory from step to step; the agent itself forgets where an episode ends.
     :meth:`begin` comes before every rollout.

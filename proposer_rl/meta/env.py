@@ -66,7 +66,7 @@ class Learner(Protocol):
 
 
 class SolverView:
-    """What a Proposer sees of Solvers: their performance and their answers on target levels.
+    """A Proposer's observation of Solvers: their performance and outputs on target levels.
 
     The validation levels, on which performance is measured, and the probe levels, on which answers
     are shown, are drawn anew for every cycle.

@@ -17,7 +17,7 @@ LEAST_SUCCESS = 1e-3
 
 
 class TrainingStep(NamedTuple):
-    """What a reward sees: one PPO update of K Solvers.
+    """One PPO update of K Solvers, from which a Proposer's reward is computed.
 
     Attributes:
         levels: what they trained on, batch [K, P].

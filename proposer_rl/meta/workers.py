@@ -32,7 +32,7 @@ class WorkersError(RuntimeError):
 
 
 class WorkerSettings(NamedTuple):
-    """Where the replicas of the Solver are trained, if not in this process.
+    """Settings of the worker processes in which replicas of the Solver are trained.
 
     Attributes:
         engine: ``"multiprocess"``: processes of this machine, by TorchRL's
@@ -116,7 +116,7 @@ def start(
 
 
 def lost(settings: WorkerSettings) -> tuple[type[Exception], ...]:
-    """Returns the errors that a collector raises where a worker is lost."""
+    """Returns the exception classes by which a collector reports a lost worker."""
     if settings.engine != "ray":
         return LOST
     from ray.exceptions import RayError

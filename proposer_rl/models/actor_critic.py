@@ -138,7 +138,7 @@ class ActorCritic(TensorDictModuleBase):
         )
 
     def actor(self, *, sample: bool = False) -> ProbabilisticTensorDictSequential:
-        """This actor-critic as a TorchRL policy, for collectors and losses of other code.
+        """Returns this actor-critic as a TorchRL policy, for collectors and losses of other code.
 
         An environment around which an agent with memory acts needs its :meth:`primer`. The critic
         of a loss is the agent itself. TorchRL's ``GAE`` takes ``value_network=None``: the values of
@@ -309,7 +309,7 @@ class RunningMoments(nn.Module):
 
 
 class Normalization(nn.Module):
-    """What an agent is shown, and the unit of its values.
+    """Running standardisation of an agent's observations and of the unit of its values.
 
     Rewards stay what they are. Instead the critic's outputs are multiplied with the standard
     deviation of the discounted return, and its loss is taken in that unit: the same as rewards

@@ -264,7 +264,7 @@ _networks = threading.local()
 
 
 def _own_network(network: nn.Module) -> nn.Module:
-    """This thread's own copy of a template: functional calls put parameters into it meanwhile."""
+    """Returns this thread's own copy of a template, since functional calls change it."""
     own = getattr(_networks, "of", None)
     if own is None or own[0] is not network:
         own = _networks.of = (network, copy.deepcopy(network))

@@ -12,7 +12,7 @@ import torch
 
 
 class _State(NamedTuple):
-    """What decides on results wherever nothing else is said."""
+    """Torch's defaults that results depend on."""
 
     dtype: torch.dtype
     gradients: bool
@@ -45,7 +45,7 @@ def _now() -> _State:
 
 @contextmanager
 def own_state() -> Iterator[None]:
-    """Compute in float32, with gradients and on the CPU wherever nothing else is said.
+    """Sets float32, gradients and the CPU as torch's defaults inside, the caller's afterwards.
 
     Afterwards torch is as the caller has set it, or a module of theirs that was imported meanwhile.
     The default precision is the whole process's: threads beside this one see float32 meanwhile.
@@ -73,7 +73,7 @@ def own_state() -> Iterator[None]:
 
 @contextmanager
 def callers_state() -> Iterator[None]:
-    """Inside of :func:`own_state`, run what is the caller's in their state.
+    """Restores the caller's torch defaults inside of :func:`own_state`.
 
     What that changes there is theirs the next time, too. Elsewhere nothing is changed.
     """

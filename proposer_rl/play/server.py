@@ -7,7 +7,6 @@ is read but those of the page, which are in memory, and the run's.
 
 from __future__ import annotations
 
-import asyncio
 import secrets
 import socket
 from collections.abc import Awaitable, Callable
@@ -25,14 +24,11 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from proposer_rl.play.session import LARGEST_BODY, Examine, Session, Source, Write
 from proposer_rl.runs.records import checked, printable
 
 HOSTS = ["127.0.0.1", "localhost"]
-CONNECTIONS = 256  # at once; of more, the one that has asked nothing for longest is closed
-SECONDS_TO_ASK = 10.0  # for the body of a request
 LARGEST_REFUSED = 2**26  # bytes of a body that are read to their end, so that its sender is told
 STATIC = Path(__file__).parent / "static"
 TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
@@ -52,7 +48,7 @@ HEADERS = {
 
 
 def application(session: Session, token: str) -> Starlette:
-    """The page and what it asks, all below ``/TOKEN/``."""
+    """Returns the application: the page, and what it asks for, all below ``/TOKEN/``."""
     asked: dict[str, tuple[Any, Callable[[Any], Any]]] = {
         "examine": (Examine, session.examine),
         "levels": (Source, session.levels),
@@ -84,7 +80,7 @@ class Guard:
         self._app, self._token = app, token.encode()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or refuse it."""
+        """Answers a request, or refuses it."""
 
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -107,7 +103,7 @@ class Guard:
 
 
 def listen(port: int) -> socket.socket:
-    """A socket on the loopback address, at port 0 on a free one.
+    """Returns a socket on the loopback address; port 0 takes a free one.
 
     Raises:
         OSError: if it cannot be had.
@@ -124,7 +120,7 @@ def listen(port: int) -> socket.socket:
 
 
 def server(app: Starlette) -> uvicorn.Server:
-    """What answers: ``run(sockets=[listen(0)])`` it, until a signal comes."""
+    """Returns a server; ``run(sockets=[listen(0)])`` answers until a signal comes."""
     return uvicorn.Server(
         uvicorn.Config(
             app,
@@ -132,24 +128,10 @@ def server(app: Starlette) -> uvicorn.Server:
             server_header=False,
             ws="none",
             lifespan="off",
-            http=Connection,
-            limit_concurrency=2 * CONNECTIONS,  # all of which ask
+            http="h11",
             timeout_graceful_shutdown=2,
         )
     )
-
-
-class Connection(H11Protocol):
-    """A connection; there is always room for a further one where others only wait."""
-
-    def connection_made(self, transport: Any) -> None:
-        """Let it in, in the place of the one that has been without a question for longest."""
-        super().connection_made(transport)
-        self.begun = self.loop.time()
-        others: Any = self.connections - {self}
-        idle = [other for other in others if not other.cycle or other.cycle.response_complete]
-        if len(others) >= CONNECTIONS and idle:
-            min(idle, key=lambda other: other.begun).transport.close()
 
 
 def _file(file: Path) -> Callable[[Request], Awaitable[Response]]:
@@ -166,30 +148,21 @@ async def _told(function: Callable[[], Any], _: Request) -> Response:
 
 
 async def _answered(kind: Any, function: Callable[[Any], Any], request: Request) -> Response:
-    body, size = bytearray(), 0
-    try:
-        async with asyncio.timeout(SECONDS_TO_ASK):
-            async for chunk in request.stream():
-                size += len(chunk)
-                if size <= LARGEST_BODY:
-                    body += chunk
-                if size > LARGEST_REFUSED:
-                    break
-    except TimeoutError:
-        return _closing(408, f"must be sent in {SECONDS_TO_ASK:.0f} seconds")
-    if size > LARGEST_BODY:
-        return _closing(413, f"at most {LARGEST_BODY:,} bytes are read")
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > LARGEST_REFUSED:
+            break
+    if len(body) > LARGEST_BODY:
+        error = {"error": f"at most {LARGEST_BODY:,} bytes are read"}
+        return JSONResponse(error, status_code=413, headers={"Connection": "close"})
     if request.headers.get("content-type") != "application/json":
         return JSONResponse({"error": "must be application/json"}, status_code=415)
     return await _result(lambda: function(checked(kind, bytes(body), "")))
 
 
-def _closing(status: int, error: str) -> Response:
-    return JSONResponse({"error": error}, status, headers={"Connection": "close"})
-
-
 async def _result(function: Callable[[], Any]) -> Response:
-    """What a function returns, as JSON; or in one line why it does not."""
+    """Returns what a function returns, as JSON; or the line of its error."""
     try:
         return JSONResponse(await run_in_threadpool(function))
     except (ValueError, OSError) as error:

@@ -36,13 +36,13 @@ Rows = Annotated[list[Row], Field(min_length=1, max_length=LARGEST_SIDE)]
 
 
 class Question(BaseModel):
-    """JSON with these keys and no others, each of its own type."""
+    """A request in JSON with these keys and no others, each of its own type."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class Examine(Question):
-    """What does a Solver do on this drawing?
+    """A request for what a Solver does on a drawing.
 
     Attributes:
         checkpoint: its number, one of those that the run has.
@@ -58,7 +58,7 @@ class Examine(Question):
 
 
 class Drawn(Question):
-    """Levels drawn from a distribution, and how a Solver does there."""
+    """A request for levels drawn from a distribution, with a Solver's results there."""
 
     source: Literal["distribution"]
     name: Name
@@ -68,28 +68,28 @@ class Drawn(Question):
 
 
 class OfSet(Question):
-    """The levels of a shipped set."""
+    """A request for the levels of a shipped set."""
 
     source: Literal["set"]
     name: Name
 
 
 class OfCurriculum(Question):
-    """Levels that were trained on: a row of the run's ``curriculum.jsonl``."""
+    """A request for levels that were trained on, a row of the run's ``curriculum.jsonl``."""
 
     source: Literal["curriculum"]
     row: Number
 
 
 class OfFile(Question):
-    """The levels in the text of a file."""
+    """A request for the levels in the text of a file."""
 
     source: Literal["file"]
     text: Annotated[str, Field(max_length=LARGEST_BODY)]
 
 
 class Write(Question):
-    """The text of a file with this drawing."""
+    """A request for the text of a file with a drawing."""
 
     name: Name
     rows: Rows
@@ -99,7 +99,7 @@ Source = Annotated[Drawn | OfSet | OfCurriculum | OfFile, Field(discriminator="s
 
 
 class Session:
-    """A run that is shown; nothing in its folder is changed.
+    """A run and its checkpoints as the page shows them; nothing in its folder is changed.
 
     One thread at a time computes; the others wait.
     """
@@ -116,7 +116,7 @@ class Session:
         self._facts = {key: facts[key] for key in ("title", "levels", "key")}
 
     def about(self) -> dict[str, Any]:
-        """The run as it is now: what can be asked for, for JSON."""
+        """Returns the run's checkpoints, seeds, levels and board as they are now, for JSON."""
         board = self._board
         return {
             "title": self._title,
@@ -139,7 +139,7 @@ class Session:
         }
 
     def examine(self, question: Examine) -> dict[str, Any]:
-        """What a Solver does on a drawing; see :meth:`~proposer_rl.task.Board.examine`.
+        """Returns what a Solver does on a drawing; see :meth:`~proposer_rl.task.Board.examine`.
 
         Raises:
             ValueError: if there is no such Solver, or the drawing is no level.
@@ -153,7 +153,7 @@ class Session:
         return {"updates": updates, **result}
 
     def levels(self, question: Drawn | OfSet | OfCurriculum | OfFile) -> dict[str, Any]:
-        """Levels to choose from: pictures, with drawings where the task has a board.
+        """Returns levels to choose from: pictures, and drawings where the task has a board.
 
         Raises:
             ValueError: if there are no such levels.
@@ -171,7 +171,7 @@ class Session:
             return self._named(self._require_board().level_set(question.name))
 
     def write(self, question: Write) -> dict[str, Any]:
-        """The text of a file with a drawing.
+        """Returns the text of a file with a drawing.
 
         Raises:
             ValueError: if it cannot stand in a file.

@@ -37,12 +37,12 @@ class Arena:
 
     @property
     def reference(self) -> str:
-        """What methods are measured against, in words."""
+        """The baselines that methods are measured against, in words."""
         *others, last = self.baselines
         return f"the better of {', '.join(others)} and {last}" if others else last
 
     def difference(self, task: str, one: str, other: str) -> Estimate | None:
-        """How two methods differ in the mean headline along training; None if one is not there."""
+        """Returns how two methods differ in the mean headline along training; None without both."""
         study = self.tasks[task]
         groups = [study.group(label) for label in (one, other)]
         if groups[0] is None or groups[1] is None:
@@ -81,7 +81,7 @@ class Arena:
 
     @cached_property
     def leads(self) -> dict[str, tuple[Estimate, float]]:
-        """How far the first method is before each other in the mean, with Holm's p-value."""
+        """By how much the first method leads each other one in the mean, with Holm's p-value."""
         first, *others = self.found
         means = [statistics.mean_of_estimates(self._common(first, other)) for other in others]
         corrected = statistics.holm([mean.p for mean in means])
@@ -93,7 +93,7 @@ class Arena:
 
 
 def arena(studies: Sequence[Study], baselines: Sequence[str] = ()) -> Arena | None:
-    """The tasks of some studies that have all baselines and measure a rate; None of fewer than two.
+    """Returns the tasks that have all baselines and measure a rate; None for fewer than two.
 
     Args:
         studies: each a task.
@@ -112,7 +112,7 @@ def arena(studies: Sequence[Study], baselines: Sequence[str] = ()) -> Arena | No
 
 
 def summary(arena: Arena) -> Table:
-    """A row for each method: the worst case over tasks, the mean, and how far the first leads."""
+    """Returns a row for each method: worst case over tasks, mean, and the first method's lead."""
     first, *_ = arena.found
     rows: list[dict[str, Cell]] = []
     every = len(arena.tasks)
@@ -149,7 +149,7 @@ def summary(arena: Arena) -> Table:
 
 
 def task_table(arena: Arena) -> Table:
-    """A row for each method and task: the differences to every baseline and to the better one."""
+    """Returns a row for each method and task: its differences to the baselines."""
     rows: list[dict[str, Cell]] = []
     for label, found in arena.found.items():
         for task, to_better in found.items():
@@ -175,7 +175,7 @@ def task_table(arena: Arena) -> Table:
 
 
 def answer(arena: Arena) -> tuple[str, str]:
-    """Which method has the best worst case, and whether it is better in the mean than others."""
+    """Returns two sentences: the method of the best worst case, and how it compares in the mean."""
     first, found = next(iter(arena.found.items()))
     worst = write(_worst(found).interval())
     beaten = [p <= ERROR and lead.value > 0 for lead, p in arena.leads.values()]
@@ -190,7 +190,7 @@ def answer(arena: Arena) -> tuple[str, str]:
 
 
 def differences(arena: Arena) -> Drawing:
-    """Every method's difference to the better baseline on every task, with its interval."""
+    """Returns a figure of each method's difference to the better baseline on every task."""
     count = len(arena.found)
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
@@ -244,7 +244,7 @@ def _worst(found: Mapping[str, Estimate]) -> Estimate:
 
 
 def _names(studies: Sequence[Study]) -> list[str]:
-    """What the tasks were called on the command lines, or else their titles; each but once."""
+    """Returns unique names of tasks: as on the command lines, or else the studies' titles."""
     names, seen = [], Counter[str]()
     for study in studies:
         given = study.example.facts.get("overrides")

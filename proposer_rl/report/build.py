@@ -13,7 +13,7 @@ from tqdm import tqdm
 from proposer_rl.report import arena, figures, outcomes, page, runs
 from proposer_rl.report.charts import charts
 from proposer_rl.report.outcomes import Meanings, answer
-from proposer_rl.report.reading import OutputError, find_runs
+from proposer_rl.report.reading import OutputError, begun, find_runs
 from proposer_rl.report.statistics import FEWEST, HELD
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, render
@@ -52,9 +52,11 @@ SELECTION = {
 def read_checked(
     folders: Sequence[Path], threshold: float | None, baselines: Sequence[str]
 ) -> tuple[list[Study], list[str]]:
-    """The studies of the runs in some folders; see :func:`write_report`."""
-    first = next(iter(baselines), None)
-    studies, notes = read_studies(find_runs(folders), threshold, first)
+    """Returns the studies of the runs in some folders and notes; see :func:`write_report`."""
+    first, found = next(iter(baselines), None), find_runs(folders)
+    studies, notes = read_studies(found, threshold, first)
+    unmeasured = {path for folder in folders for path in begun(folder)} - {*found}
+    notes += [f"not read: {path.name}: it has measured nothing" for path in sorted(unmeasured)]
     labels = sorted({group.label for study in studies for group in study.compared})
     for baseline in baselines:
         if baseline not in labels:
@@ -73,7 +75,7 @@ def write_report(
     progress: bool = True,
     meanings: Meanings | None = None,
 ) -> Path:
-    """Write a report.
+    """Writes a report and returns the path of its page.
 
     Args:
         folders: of runs, or with runs in them.
@@ -120,7 +122,7 @@ def write_report(
 
 
 def check_output(output: Path, *signs: str) -> None:
-    """Refuse a folder with files of somebody else."""
+    """Refuses an output folder that holds files which no report has written."""
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output}: is a file; give a folder for the report")
     occupied = output.is_dir() and any(output.iterdir())
@@ -132,7 +134,7 @@ def check_output(output: Path, *signs: str) -> None:
 
 
 def _over_tasks(compared: arena.Arena, files: dict[str, bytes]) -> page.Section:
-    """What the page shows of several tasks first; its files are added to the others."""
+    """Returns the page's section on several tasks, and adds its files to ``files``."""
     tables = [arena.summary(compared), arena.task_table(compared)]
     _add(tables, "", files)
     drawing = arena.differences(compared)
@@ -155,7 +157,7 @@ def _add(tables: Sequence[Table], prefix: str, files: dict[str, bytes]) -> None:
 def _section(
     study: Study, prefix: str, files: dict[str, bytes], bar: tqdm, meanings: Meanings
 ) -> page.Section:
-    """What the page shows of a study; its files are added to the others."""
+    """Returns the page's section on a study, and adds its files to ``files``."""
     methods = outcomes.group_table(study)
     tables = [outcomes.comparison_table(study), outcomes.run_table(study)]
     _add([methods, *tables], prefix, files)

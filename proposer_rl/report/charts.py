@@ -32,7 +32,7 @@ MOST_BYTES = 2**20  # of all pictures of a study
 
 
 def charts(study: Study) -> dict[str, Json]:
-    """All that the page draws of a study.
+    """Returns everything that the page draws of a study, ready for JSON.
 
     Returns:
         ``methods``: each with its look and seeds. ``axes``: what can be on the abscissa.
@@ -64,7 +64,7 @@ def charts(study: Study) -> dict[str, Json]:
 
 
 def plain(values: Iterable[float]) -> list[float | None]:
-    """Numbers as JSON has them, with five significant digits; null for what is none."""
+    """Returns numbers with five significant digits, and None for those that are not finite."""
     return [float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in map(float, values)]
 
 
@@ -79,7 +79,7 @@ def _measure(study: Study, measure: Measure) -> Json:
 
 
 def _levels(study: Study) -> list[Json]:
-    """What the methods reach on every single level at the end, mean over seeds."""
+    """Returns the methods' final results on every single level, means over seeds."""
     every = {
         name: [study.scores(group, name) for group in study.groups]
         for name in measures.of_levels(study)
@@ -111,7 +111,7 @@ def _series(series: Series | None) -> Json:
 
 
 def _outcomes(study: Study) -> list[Json]:
-    """What the methods are compared by."""
+    """Returns each outcome with the methods' estimates and the values of their runs."""
     return [
         {
             "name": outcome.name,
@@ -129,15 +129,15 @@ def _outcomes(study: Study) -> list[Json]:
 
 
 def _estimate(study: Study, group: Group, outcome: Outcome) -> Sequence[float]:
-    """Median and interval; empty without a run of full length."""
+    """Returns the median and its interval; empty without a run of full length."""
     whole = study.group(group.label)
     return (whole and outcome.median(whole)) or ()
 
 
 def _stages(study: Study) -> dict[str, Json] | None:
-    """What the page's slider shows: of every method one run, the first that recorded levels.
+    """Returns what the page's slider shows: one run of each method, the first with recorded levels.
 
-    Where none of a method's runs did, the first that recorded proposals.
+    If none of a method's runs has any, it is the first that recorded proposals.
 
     Returns:
         ``axes``: names and values of the space of levels, at most two. ``pictures``: each once, a
@@ -203,7 +203,7 @@ def _method(run: Run, study: Study, most: int, pictures: dict[str, int]) -> dict
 
 
 def _cycles(run: Run) -> list[Record]:
-    """A run's cycles without those that say that they are another seed's."""
+    """Returns a run's cycles without those that are marked as another seed's."""
     return [cycle for cycle in run.cycles if number(cycle.get("seed", run.seed)) == run.seed]
 
 
@@ -214,9 +214,9 @@ def _level(level: LevelRecord, pictures: dict[str, int]) -> Json:
 
 @lru_cache(4 * LEVELS * STAGES[0])
 def _small(stored: str | None) -> str | None:
-    """A picture as PNG in base64, no larger than what is shown of it; None if it is none.
+    """Returns a picture as PNG in base64, scaled down for display; None if it cannot be read.
 
-    Where all do not fit, the same are asked for again.
+    Results are kept, since fewer stages are tried with the same pictures if all do not fit.
     """
     pixels = picture(stored)
     if pixels is None:
@@ -228,7 +228,7 @@ def _small(stored: str | None) -> str | None:
 
 
 def _map(run: Run, like: Run, updates: int) -> Json:
-    """The last shares of proposals that were on record after that many updates."""
+    """Returns the shares of proposals that were last recorded up to that update; None without."""
     shares = [
         found
         for cycle in _cycles(run)

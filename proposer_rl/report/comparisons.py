@@ -36,22 +36,22 @@ class Outcome(NamedTuple):
     sign: int = 1
 
     def known(self, group: Group) -> dict[int, float]:
-        """The value of each of a group's runs that has one, by its seed."""
+        """Returns the outcome of each of a group's runs that has one, by the run's seed."""
         found = {run.seed: self.value(run) for run in group.runs}
         return {seed: value for seed, value in found.items() if not math.isnan(value)}
 
     def values(self, group: Group) -> list[float]:
-        """The known values of a group's runs."""
+        """Returns the known outcomes of a group's runs."""
         return list(self.known(group).values())
 
     def median(self, group: Group) -> Interval | None:
-        """Their median with its interval; None without any."""
+        """Returns the median of a group's outcomes with its interval; None without any."""
         values = self.values(group)
         return statistics.median_interval(values) if values else None
 
 
 class Decision(NamedTuple):
-    """Which of two methods is better, by an outcome.
+    """The decision on which of two methods is better, by an outcome.
 
     Attributes:
         winner: its label; None where neither is said to be better.
@@ -69,7 +69,7 @@ class Decision(NamedTuple):
 
 
 def primary(study: Study) -> Outcome:
-    """The outcome that decides whether a method beats another.
+    """Returns the outcome that decides whether a method beats another.
 
     The mean of the headline along training: every run has it, whether it gets to the threshold or
     not; it sees the way and the end; and as a mean over many measurements it varies little.
@@ -80,7 +80,7 @@ def primary(study: Study) -> Outcome:
 
 
 def waiting_outcome(study: Study) -> Outcome:
-    """Updates to the threshold of the headline, cut at the horizon."""
+    """Returns the outcome "updates until the headline reaches a threshold", cut at the horizon."""
     name, threshold, horizon = study.headline, study.threshold, study.horizon
     return Outcome(
         f"updates to {level_text(name, threshold)} {words(name)} (at most {horizon})",
@@ -90,19 +90,19 @@ def waiting_outcome(study: Study) -> Outcome:
 
 
 def at_the_end(study: Study, name: str) -> Outcome:
-    """A measurement at the horizon."""
+    """Returns the outcome "a measurement at the horizon"."""
     value = partial(Run.at, measurement=name, updates=study.horizon)
     return Outcome(f"{words(name)} after {study.horizon} updates", value)
 
 
 def outcomes(study: Study) -> list[Outcome]:
-    """The primary outcome, then the secondary ones, on which nothing is decided."""
+    """Returns the primary outcome, then the secondary ones, on which nothing is decided."""
     ends = [at_the_end(study, name) for name in study.measurements]
     return [primary(study), waiting_outcome(study), *ends]
 
 
 def difference(outcome: Outcome, one: Group, other: Group) -> Estimate:
-    """How two groups differ by an outcome.
+    """Returns the difference of two groups' mean outcomes.
 
     Runs of the same seed begin with the same weights and draw the same numbers: where both groups
     have the same seeds, they are compared in pairs.
@@ -116,7 +116,7 @@ def _difference(one: Mapping[int, float], other: Mapping[int, float]) -> Estimat
 
 
 def learnt(group: Group, name: str, updates: float) -> bool:
-    """Whether a measurement is shown to have grown by then, a rate by more than :data:`ALIKE`."""
+    """Returns whether a measurement has grown significantly, a rate by more than :data:`ALIKE`."""
     gains = np.array([run.at(name, updates) - run.metrics[name].iloc[0] for run in group.runs])
     known = gains[~np.isnan(gains)]
     if len(known) < statistics.FEWEST:

@@ -45,7 +45,7 @@ MOST_TICKS = 10
 
 
 def learning_curves(study: Study) -> Drawing:
-    """The paper's Figure 2: success on every distribution, and updates to the threshold."""
+    """Draws measurements along training and updates to the threshold (the paper's Figure 2)."""
     every = measures.measured(study)
     panels = [
         partial(_draw_curves, study=study, measure=every[name])
@@ -66,7 +66,7 @@ def learning_curves(study: Study) -> Drawing:
 
 
 def cost_curves(study: Study) -> Drawing:
-    """The headline against updates and every cost, the curriculum's part included."""
+    """Draws the headline against updates and every cost, the curriculum's part included."""
     measure = measures.measured(study)[study.headline]
     seconds = (
         "Seconds: of the whole process, evaluation included; where seeds were trained together, "
@@ -89,7 +89,7 @@ def cost_curves(study: Study) -> Drawing:
 
 
 def difficulty(study: Study) -> Drawing | None:
-    """What the Solver trained on; None where no run has statistics of it."""
+    """Draws statistics of the levels trained on; None where no run has recorded any."""
     every = measures.trained(study)
     shown = [g for g in study.groups if any(each.axes[UPDATES](g) is not None for each in every)]
     if not shown:
@@ -106,7 +106,7 @@ def difficulty(study: Study) -> Drawing | None:
 
 
 def draw_series(axes: Axes, series: Series, look: Look) -> np.ndarray:
-    """Median and interval of runs, or all of them where they are too few for an interval.
+    """Draws the median and interval of runs, and every run where they are too few for one.
 
     Returns:
         The median, float [n].
@@ -151,7 +151,7 @@ def _draw_bars(figure: FigureBase, study: Study) -> None:
             fontsize=8,
         )
     axes.set_yticks(range(len(found)), [fill(group.label, 32) for _, group in found], fontsize=8)
-    axes.set_xlim(0, horizon * 1.42)
+    axes.set_xlim(0, max(horizon, 1) * 1.42)  # of a run that has just begun
     axes.set_xticks([tick for tick in axes.get_xticks() if tick <= horizon])
     axes.axvline(horizon, color="0.4", linewidth=0.8, linestyle=":")
     axes.grid(axis="y", visible=False)
@@ -159,7 +159,7 @@ def _draw_bars(figure: FigureBase, study: Study) -> None:
 
 
 def along_training(study: Study) -> Drawing | None:
-    """The paper's Figure 3: levels of the batch at several stages."""
+    """Draws levels of the batch at several stages of training (the paper's Figure 3)."""
     shown = [(group.label, group.runs[0].samples) for group in study.groups]
     panels = [
         partial(_draw_stages, samples=samples, title=label)
@@ -179,7 +179,7 @@ def along_training(study: Study) -> Drawing | None:
 
 
 def side_by_side(study: Study) -> Drawing | None:
-    """The paper's Figure 5: the distributions measured on, early and late proposals."""
+    """Draws levels measured on beside early and late proposals (the paper's Figure 5)."""
     task = study.example.task
     rows = [(words(name), task.samples.get(name, [])) for name in task.distributions]
     for group in study.groups:
@@ -196,7 +196,7 @@ def side_by_side(study: Study) -> Drawing | None:
 
 
 def recorded_by_curricula(study: Study) -> Drawing | None:
-    """Levels that curricula recorded: the last time, of each method's first seed."""
+    """Draws the levels that curricula recorded last, of each method's first seed."""
     task = study.example.task
     rows = [
         (f"{group.label}: {caption}", levels)
@@ -215,7 +215,7 @@ def recorded_by_curricula(study: Study) -> Drawing | None:
 def _in_rows(
     rows: Sequence[tuple[str, Sequence[LevelRecord]]], name: str, title: str, caption: str
 ) -> Drawing | None:
-    """A row of pictures for each title that has any; None without one."""
+    """Returns a figure with a row of pictures for each title that has any; None without one."""
     panels = [
         partial(_draw_row, levels=levels, title=head)
         for head, levels in rows
@@ -226,7 +226,7 @@ def _in_rows(
 
 
 def draw_run(folder: Path, title: str) -> Path:
-    """Draw ``run.png`` of a run: what was measured on every distribution, and levels trained on."""
+    """Draws ``run.png`` in a run's folder, measurements and levels trained on; returns its path."""
     runs = read_run(folder)
     height = (SIDE + 0.15) * BATCH + 0.4
     with rc_context(SETTINGS):
@@ -272,7 +272,7 @@ def _draw_row(figure: FigureBase, levels: Sequence[LevelRecord], title: str) -> 
 
 
 def _show(places: Sequence[Axes], levels: Sequence[LevelRecord]) -> None:
-    """Draw pictures of levels; a place stays empty where there is none that can be shown."""
+    """Draws pictures of levels; a place stays empty where there is none that can be shown."""
     for axes in places:
         axes.set_axis_off()
     for axes, level in zip(places, levels, strict=False):
@@ -282,7 +282,7 @@ def _show(places: Sequence[Axes], levels: Sequence[LevelRecord]) -> None:
 
 
 def heat_maps(study: Study) -> Drawing | None:
-    """Where in the space of levels the proposals lie, along training."""
+    """Draws where in the space of levels the proposals lie, along training; None without any."""
     found = [(group, maps) for group in study.groups if (maps := _histograms(group)) is not None]
     if not found:
         return None
@@ -302,7 +302,7 @@ def heat_maps(study: Study) -> Drawing | None:
 
 
 def last_map(folder: Path) -> NDArray[np.uint8] | None:
-    """The heat map of a run's last cycle, uint8 [H, W, 3]; None without recorded proposals."""
+    """Returns the heat map of a run's last cycle, uint8 [H, W, 3]; None without proposals."""
     run = read_run(folder)[0]
     shares = run.shares(run.cycles[-1]) if run.cycles else None
     if shares is None:
@@ -355,7 +355,7 @@ def _ticks(values: Sequence[float]) -> tuple[Column, list[str]]:
 
 
 def _histograms(group: Group) -> tuple[Column, Column] | None:
-    """Shares of proposals by cycle, [cycles, rows, columns], mean over the runs."""
+    """Returns updates [cycles] and shares of proposals [cycles, rows, columns], means over runs."""
     by_updates: dict[float, list[Column]] = {}
     for run in group.logs:
         for cycle in run.cycles:

@@ -73,13 +73,13 @@ class Measure(NamedTuple):
 
 
 def every(study: Study) -> list[Measure]:
-    """All that can be drawn of a study."""
+    """Returns all measures that can be drawn of a study."""
     solver, curricula = [*measured(study).values(), *trained(study)], gains(study)
     return [*solver, *curricula, *own_numbers(study), *worst(study)]
 
 
 def measured(study: Study) -> dict[str, Measure]:
-    """What was measured of the Solver against updates and every cost, by its column."""
+    """Returns measures of the Solver against updates and every cost, by the table's column."""
     known = dict.fromkeys(name for run in study.runs for name in run.metrics if name not in COST)
     first = [*study.measurements, *(f"{name}_worst10" for name in study.measurements)]
     return {
@@ -97,7 +97,7 @@ def measured(study: Study) -> dict[str, Measure]:
 
 
 def trained(study: Study) -> list[Measure]:
-    """The task's statistics of the batches."""
+    """Returns measures of the levels trained on, the task's own statistics."""
     names = dict.fromkeys(name for run in study.runs for name in run.statistics)
     return [
         Measure(
@@ -111,7 +111,7 @@ def trained(study: Study) -> list[Measure]:
 
 
 def gains(study: Study) -> list[Measure]:
-    """Maximum and mean of the gains of a cycle's replicas."""
+    """Returns the maximum and the mean of the gains of a cycle's replicas."""
     names = dict.fromkeys(filter(None, map(recorded_gain, study.groups)))
     return [
         _of_cycles(
@@ -124,7 +124,7 @@ def gains(study: Study) -> list[Measure]:
 
 
 def own_numbers(study: Study) -> list[Measure]:
-    """Shares of batches, and whatever numbers of cycles are not drawn elsewhere."""
+    """Returns shares of batches, and all numbers of cycles that are not drawn elsewhere."""
     cycles = [cycle for group in study.groups for run in group.logs for cycle in run.cycles]
     found = {name for c in cycles for name, value in c.items() if not math.isnan(number(value))}
     names = {n for n in found - PLACE - GAINS.keys() if n.isprintable() and len(n) <= LONGEST_TEXT}
@@ -142,7 +142,7 @@ def own_numbers(study: Study) -> list[Measure]:
 
 
 def worst(study: Study) -> list[Measure]:
-    """The mean over the worst levels at the end against their share (CVaR)."""
+    """Returns means over the worst levels at the end against their share (CVaR)."""
     levels = study.example.task.levels
     return [
         Measure(
@@ -157,13 +157,14 @@ def worst(study: Study) -> list[Measure]:
 
 
 def axis_text(name: str) -> str:
-    """A measurement as an axis is named."""
-    rate = " rate" if is_rate(name) else ""
-    return f"{words(name).replace('worst10', 'on the worst 10 %')}{rate}"
+    """Returns the name of an axis for a column, such as "ID success rate"."""
+    plain = name.removesuffix("_worst10")
+    worst = " on the worst 10 %" if plain != name else ""
+    return f"{words(plain)}{' rate' if is_rate(name) else ''}{worst}"
 
 
 def over_updates(group: Group, name: str, table: str = "metrics") -> Series | None:
-    """A column of the runs' ``metrics`` or ``training`` against updates; None where no run has it.
+    """Returns a column of a run's ``metrics`` or ``training`` against updates, or None.
 
     Runs that were evaluated at different updates have no value at those of the others.
     """
@@ -172,7 +173,7 @@ def over_updates(group: Group, name: str, table: str = "metrics") -> Series | No
 
 
 def over_cost(group: Group, name: str, cost: Callable[[Run], Column]) -> Series | None:
-    """A measurement against a cost; None where no run has it.
+    """Returns a measurement of a group's runs against a cost; None where no run has it.
 
     Runs stand at different costs when they are measured, so they are interpolated in between.
     """
@@ -185,7 +186,7 @@ def over_cost(group: Group, name: str, cost: Callable[[Run], Column]) -> Series 
 
 
 def over_cycles(group: Group, value: Value) -> Series | None:
-    """A number of every cycle against updates, for each of the group's records of cycles."""
+    """Returns a number of every cycle against updates, a row for each folder's cycles."""
     return _aligned(
         {
             run.seed: ([number(c["updates"]) for c in run.cycles], [value(c) for c in run.cycles])
@@ -201,7 +202,7 @@ def _aligned(runs: Mapping[int, tuple[Iterable[float], Iterable[float]]]) -> Ser
 
 
 def worst_means(scores: Column, shares: Column) -> Column:
-    """Mean over the worst share of the levels, the conditional value at risk (CVaR).
+    """Returns means over the worst shares of the levels, the conditional value at risk (CVaR).
 
     A level counts in part where the share is no whole number of levels (Acerbi & Tasche, Journal of
     Banking & Finance 26, 2002, definition 3).
@@ -221,20 +222,20 @@ def worst_means(scores: Column, shares: Column) -> Column:
 
 
 def of_levels(study: Study) -> list[str]:
-    """The measurements that some run has for every single level."""
+    """Returns the measurements that some run has for every single level."""
     groups = study.groups
     return [n for n in study.measurements if any(study.scores(g, n) is not None for g in groups)]
 
 
 def recorded_gain(group: Group) -> str | None:
-    """Which gain of the replicas a group has on record; None without one."""
+    """Returns the name of the replicas' gain that a group has recorded; None without one."""
     cycles = [cycle for run in group.logs for cycle in run.cycles]
     every = (name for name in GAINS if any(numbers(c.get(name)) is not None for c in cycles))
     return next(every, None)
 
 
 def of_gains(cycle: Record, names: Iterable[str], reduce: Callable[[Column], float]) -> float:
-    """A number of a cycle's gains, of the first that it has; NaN where it has none."""
+    """Returns a statistic of the first of the named gains that a cycle has; NaN without any."""
     found = [values for name in names if (values := numbers(cycle.get(name))) is not None]
     return float(reduce(found[0])) if found else np.nan
 

@@ -40,7 +40,7 @@ LISTED = 6  # methods that a sentence names
 
 
 def comparison_table(study: Study) -> Table:
-    """Every pair of groups by every outcome."""
+    """Returns a table of all pairs of groups by every outcome."""
     decided = decisions(study)
     rows: list[dict[str, Cell]] = []
     for number, outcome in enumerate(outcomes(study)):
@@ -74,7 +74,7 @@ def comparison_table(study: Study) -> Table:
 
 
 def against_baseline(study: Study) -> Table:
-    """Every group against the baseline, by the primary outcome."""
+    """Returns a table of every group against the baseline, by the primary outcome."""
     outcome, baseline, decided = primary(study), study.baseline, decisions(study)
     rows: list[dict[str, Cell]] = []
     for group in study.compared:
@@ -97,7 +97,7 @@ def against_baseline(study: Study) -> Table:
 
 
 def group_table(study: Study) -> Table:
-    """One row per group."""
+    """Returns a table with a row for each group."""
     headline, horizon, threshold = study.headline, study.horizon, study.threshold
     first, waiting, *ends = outcomes(study)
     shown, worst = [waiting, first, *ends], f"{headline}_worst10"
@@ -138,7 +138,7 @@ def group_table(study: Study) -> Table:
 
 
 def _over_levels(study: Study, group: Group) -> dict[str, Cell]:
-    """Statistics of single levels, and against the baseline; empty where it is not known."""
+    """Returns a row's cells on single levels and the baseline; empty ones where not known."""
     name, outcome, baseline = study.headline, primary(study), study.baseline
     scores = study.scores(group, name)
     row: dict[str, Cell] = {}
@@ -157,7 +157,7 @@ def _over_levels(study: Study, group: Group) -> dict[str, Cell]:
 
 
 def run_table(study: Study) -> Table:
-    """One row per run."""
+    """Returns a table with a row for each run."""
     rows: list[dict[str, Cell]] = []
     for group in study.groups:
         for run in group.runs:
@@ -185,14 +185,16 @@ def run_table(study: Study) -> Table:
 
 
 def answer(study: Study) -> tuple[str, str]:
-    """Which method is best and how that is known, then the others against the baseline."""
+    """Returns two sentences: the best method with its test, and the others against the baseline."""
     outcome, baseline = primary(study), study.baseline
     ranked = sorted(study.compared, key=lambda group: -np.mean(outcome.values(group)))
     best, *others = ranked
     median = write(outcome.median(best))
     if not others:
+        alone = "here" if len(study.groups) == 1 else f"with runs of {study.horizon} updates"
         return (
-            f"{best.label} is the only method here ({outcome.name}: {median}, median over seeds).",
+            f"{best.label} is the only method {alone} ({outcome.name}: {median}, median over "
+            "seeds).",
             "Nothing is compared, so this page does not show whether that is good.",
         )
     found = decisions(study)
@@ -207,7 +209,7 @@ def answer(study: Study) -> tuple[str, str]:
 
 
 def meaning(group: Group, meanings: Meanings) -> str:
-    """What a method does, in a line: as its runs recorded it, or else as the caller knows it."""
+    """Returns what a method does, in a line: as its runs recorded it, or else as given."""
     run = group.runs[0]
     about = run.facts.get("about")
     own = about if isinstance(about, Mapping) else {}
@@ -221,7 +223,7 @@ def meaning(group: Group, meanings: Meanings) -> str:
 
 
 def _shown(best: Group, found: Mapping[str, Decision]) -> str:
-    """Whether the best is significantly better, and than how many of the others."""
+    """Returns a clause on how many other methods the best one beats significantly."""
     beaten = [decision.winner == best.label for decision in found.values()]
     if all(decision.verdict == TOO_FEW for decision in found.values()):
         return f"but it takes {FEWEST} seeds of each to decide whether that is more than chance"
@@ -239,7 +241,7 @@ def _shown(best: Group, found: Mapping[str, Decision]) -> str:
 
 
 def _against(baseline: Group, found: Mapping[str, Decision]) -> str:
-    """How the others stand to the baseline."""
+    """Returns a sentence on how the other methods compare to the baseline."""
     if all(decision.verdict == TOO_FEW for decision in found.values()):
         return f"Too few seeds for a comparison with the baseline, {baseline.label}."
     better = [label for label, decision in found.items() if decision.winner == label]

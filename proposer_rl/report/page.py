@@ -33,7 +33,7 @@ Section = dict[str, Any]  # all that the page shows of a study, as the template 
 
 
 def render(**content: Any) -> str:
-    """The page as HTML; whatever comes from a run is escaped or packed."""
+    """Returns the page as HTML; whatever comes from a run is escaped or packed."""
     from plotly.offline import get_plotlyjs  # what only draws figures needs no charts
 
     environment = Environment(
@@ -54,12 +54,12 @@ def render(**content: Any) -> str:
 
 
 def pack(text: str) -> str:
-    """A text as the page's script unpacks it: gzip in base64, which ends no element of HTML."""
+    """Returns a text as gzip in base64, which the page's script unpacks and no HTML can end."""
     return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
 
 
 def figure(drawing: Drawing, png: bytes) -> Section:
-    """A figure that is none of the charts, as the page shows it."""
+    """Returns what the page shows of a still figure."""
     with Image.open(io.BytesIO(png)) as image:
         width = round(image.width * PIXELS / DPI)
     content = base64.b64encode(in_few_colours(png)).decode()
@@ -72,7 +72,7 @@ def figure(drawing: Drawing, png: bytes) -> Section:
 
 
 def methods(study: Study, meanings: Meanings) -> list[Section]:
-    """The methods with their looks and what they do, in their order in the charts."""
+    """Returns the methods with their looks and what they do, in the order of the charts."""
     return [
         {
             "label": group.label,
@@ -86,7 +86,7 @@ def methods(study: Study, meanings: Meanings) -> list[Section]:
 
 
 def facts(study: Study) -> list[tuple[str, str]]:
-    """What was compared."""
+    """Returns what was compared, as labels and texts."""
     threshold = level_text(study.headline, study.threshold)
     return [
         (
@@ -100,7 +100,7 @@ def facts(study: Study) -> list[tuple[str, str]]:
 
 
 def origin(study: Study) -> list[tuple[str, str]]:
-    """With which versions, where, and for how much."""
+    """Returns software, hardware and total cost of the runs, as labels and texts."""
     runs = study.runs
     own, spent, evaluations = (sum(run.last(name) for run in runs) for name in COST[1:4])
     seconds = sum(run.own_seconds[-1] for run in runs)
@@ -116,7 +116,7 @@ def origin(study: Study) -> list[tuple[str, str]]:
 
 
 def incomplete(study: Study) -> list[str]:
-    """Runs that are not at the end of their schedule, or shorter than those that are compared."""
+    """Returns the names of runs that are unfinished or shorter than the horizon."""
     return [
         f"{group.label} seed {run.seed} ({run.updates} updates)"
         for group in study.groups
@@ -126,7 +126,7 @@ def incomplete(study: Study) -> list[str]:
 
 
 def commands(study: Study) -> list[str]:
-    """What each group was started with; seeds that differ in nothing else in one command.
+    """Returns the command of each group; one for all seeds that differ in nothing else.
 
     Seeds that were trained side by side are again, since on some tasks they draw other numbers
     alone.
@@ -145,7 +145,7 @@ def commands(study: Study) -> list[str]:
 
 
 def configs(study: Study) -> list[tuple[str, str]]:
-    """The settings of each group's first run."""
+    """Returns the label and the settings, as JSON, of each group's first run."""
     return [
         (group.label, anywhere(json.dumps(group.runs[0].config, indent=1)[:20_000]))
         for group in study.groups
@@ -153,7 +153,7 @@ def configs(study: Study) -> list[tuple[str, str]]:
 
 
 def _digest(script: str) -> str:
-    """A script as the page's Content-Security-Policy names it."""
+    """Returns the hash by which the page's Content-Security-Policy admits a script."""
     return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
 
 
@@ -164,14 +164,14 @@ def report_command(
     baselines: Sequence[str],
     *more: str,
 ) -> str:
-    """What writes this report again, from the same folder."""
+    """Returns the command that writes this report again, from the same folder."""
     asked = [] if threshold is None else [f"--threshold={threshold:g}"]
     asked += [f"--baseline={baseline}" for baseline in baselines]
     return f"{program} {shlex.join([*map(str, folders), *asked, *more])}"
 
 
 def _command(run: Run) -> str:
-    """What started a run, ending in ``seed=`` where it had but one; empty where it is not known."""
+    """Returns a run's command, ending in ``seed=`` if it had one seed; empty if not recorded."""
     overrides, arguments = run.facts.get("overrides"), run.facts.get("arguments", {})
     if not isinstance(overrides, list) or not isinstance(arguments, dict):
         return ""
@@ -221,7 +221,7 @@ def _distinct(runs: Sequence[Run], text: Any) -> str:
 
 
 def section(study: Study, figures: str) -> str:
-    """What was compared, the answer, and the tables."""
+    """Returns a study's part of a Markdown page: facts, the answer and the tables."""
     about = facts(study) + origin(study)
     if short := incomplete(study):
         text = f"Not finished, or shorter than {study.horizon} updates"
@@ -239,7 +239,7 @@ def section(study: Study, figures: str) -> str:
 
 
 def over_tasks(compared: arena.Arena, figures: str) -> str:
-    """What methods reach over several tasks: the answer, the tables and their figure."""
+    """Returns the Markdown on several tasks: the answer, the tables and their figure."""
     drawing = arena.differences(compared)
     summary, by_task = arena.summary(compared), arena.task_table(compared)
     picture = f"![{escape_markdown(drawing.title)}]({figures}{drawing.name}.png)"
@@ -259,7 +259,7 @@ def _tables(tables: Iterable[Table]) -> list[str]:
 
 
 def document(parts: Sequence[str], command: str, notes: Sequence[str]) -> str:
-    """Parts of a page, and how it is made."""
+    """Returns a Markdown page of these parts, the notes, and the command that writes it."""
     left_out = "\n".join(f"- {escape_markdown(note)}" for note in notes)
     made = f"The whole report is written by\n\n```bash\n{command}\n```"
     return "\n\n".join(filter(None, [*parts, left_out, made])) + "\n"

@@ -45,13 +45,13 @@ class UnreadableRun(ValueError):
 
 
 class OutputError(ValueError):
-    """What was asked for cannot be written; the message is one line."""
+    """The report that was asked for cannot be written; the message is one line."""
 
     exit_code = 2
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:
-    """Folders of runs and of studies: those given, or else those found within them."""
+    """Returns the folders of runs and studies in some folders, each once, sorted."""
     found: list[Path] = []
     for folder in folders:
         inside = [
@@ -69,12 +69,12 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
 
 
 def begun(folder: Path) -> list[Path]:
-    """Folders of runs in a folder, or itself; studies are left out."""
+    """Returns the folders of runs in a folder, or itself, without studies, also unmeasured ones."""
     return [path for path, files in _walk(folder) if STUDY not in files]
 
 
 def _walk(folder: Path) -> Iterator[tuple[Path, set[str]]]:
-    """Folders with the names of their files; links are not followed, hidden ones left out."""
+    """Yields folders of runs and studies with their files' names; skips links and hidden ones."""
     if not folder.is_dir():
         raise UnreadableRun(f"{folder}: there is no such folder")
     for seen, (root, names, files) in enumerate(os.walk(folder)):
@@ -89,7 +89,7 @@ def _walk(folder: Path) -> Iterator[tuple[Path, set[str]]]:
 
 
 def read_run(folder: Path) -> list[Run]:
-    """All seeds of a run's folder, or all runs of a study."""
+    """Returns all seeds of a run's folder, or all runs of a study."""
     try:
         if (folder / STUDY).exists():
             return _read_study(folder)
@@ -119,7 +119,7 @@ def _read_folder(folder: Path) -> list[Run]:
 
 
 def _read_study(folder: Path) -> list[Run]:
-    """The runs of a study, as ``bin/research publish`` writes it; they lie in the folder."""
+    """Returns the runs of a study, as ``bin/research publish`` writes it."""
     tables = {name: _by_run(folder, name) for name in NAMES}
     runs = []
     for row in _table(folder / STUDY).to_dict("records"):
@@ -148,7 +148,7 @@ def _read_study(folder: Path) -> list[Run]:
 
 
 def _table(file: Path) -> pd.DataFrame:
-    """A table of a study, its cells as text; NaN where one is empty."""
+    """Returns a table of a study with its cells as text, NaN for empty ones."""
     import lzma  # which not every Python is built with
 
     if file.is_symlink():
@@ -167,7 +167,7 @@ def _table(file: Path) -> pd.DataFrame:
 
 
 def _by_run(folder: Path, name: str) -> dict[str, pd.DataFrame]:
-    """A table of a study in those of its runs; columns that a run has nothing in are left out."""
+    """Returns a table of a study split by runs, each without columns that are empty in it."""
     if not (folder / f"{name}.csv.xz").exists():
         return {}
     table = _table(folder / f"{name}.csv.xz")
@@ -200,7 +200,7 @@ def _runs(
     levels: Sequence[LevelResults],
     samples: Sequence[SampleRecord],
 ) -> list[Run]:
-    """A run for each seed, of all that is on record; only of finished runs facts have updates."""
+    """Returns a run for each seed; ``facts`` have ``updates`` only of finished runs."""
     config = _check_config(config)
     task = checked(TaskFacts, facts["task"], "run.json: task")
     if not len(metrics):
@@ -269,7 +269,7 @@ def _check_config(config: dict[str, Any] | None) -> dict[str, Any]:
 
 
 def _levels(rows: Sequence[LevelResults], seed: int, updates: int) -> dict[str, Column]:
-    """What a seed reached on every level after that many updates."""
+    """Returns what a seed reached on every level after that many updates, [levels] by column."""
     found = {}
     for row in rows:
         if (row.seed, row.updates) == (seed, updates):
@@ -281,13 +281,13 @@ def _levels(rows: Sequence[LevelResults], seed: int, updates: int) -> dict[str, 
 
 
 def _last_sheets(cycles: Sequence[Record], sheets: Sequence[Any], seed: int) -> Any:
-    """The pictures of the last cycle that has any, of a seed where it says whose they are."""
+    """Returns the pictures of the last cycle that has any and is not another seed's."""
     own = [s for row, s in zip(cycles, sheets, strict=True) if s and row.get("seed", seed) == seed]
     return own[-1] if own else {}
 
 
 def _rounded(name: str, values: Column) -> Column:
-    """A share as it is: a sum of probabilities is rounded, to 1.0000001 too."""
+    """Returns values [n]; those of a rate are moved into 0 to 1 where rounding put them outside."""
     inside = values.clip(0, 1)
     return np.where(is_rate(name) & (np.abs(values - inside) < ROUNDING), inside, values)
 

@@ -86,7 +86,7 @@ class Run:
 
     @property
     def student(self) -> int | None:
-        """Which of several Solvers of one Proposer this was, from 0; None for a lone one."""
+        """The number of this Solver among those of one Proposer, from 0; None for a lone one."""
         found = _STUDENT.fullmatch(self.folder.name)
         return int(found[1]) if found else None
 
@@ -135,11 +135,11 @@ class Run:
         return self.columns["seconds"] / self.shared_by
 
     def last(self, name: str) -> float:
-        """The last value of a column of the measurements."""
+        """Returns the last value of a column of the measurements."""
         return float(self.columns[name][-1])
 
     def until(self, horizon: int) -> Run:
-        """The run as it was after so many updates, measurements linear between evaluations.
+        """Returns the run as it was after so many updates, linear between evaluations.
 
         What is only known of its end is left out. A shorter run stays as it is.
         """
@@ -161,22 +161,22 @@ class Run:
         )
 
     def reached(self, measurement: str, threshold: float) -> float:
-        """Updates until a measurement first reached a threshold; NaN where it never did."""
+        """Returns updates until a measurement first reached a threshold; NaN if it never did."""
         found = self.columns["updates"][self.columns[measurement] >= threshold - SLACK]
         return float(found.min()) if found.size else math.nan
 
     def waited(self, measurement: str, threshold: float, horizon: float) -> float:
-        """Updates until a threshold, cut at a horizon; NaN for a run that is not that long.
+        """Returns updates until a threshold, cut at a horizon; NaN for a shorter run.
 
-        Also where it was reached: short runs that did would else count, and those that did not
-        would not.
+        It is NaN also if a shorter run reached the threshold: else only short runs that are fast
+        would count.
         """
         if self.updates < horizon:
             return math.nan
         return float(np.fmin(self.reached(measurement, threshold), horizon))
 
     def at(self, measurement: str, updates: float) -> float:
-        """A measurement after exactly that many updates; NaN where there was none."""
+        """Returns a measurement after exactly that many updates; NaN where there was none."""
         (rows,) = np.nonzero(self.columns["updates"] == updates)
         known = len(rows) and measurement in self.columns
         return float(self.columns[measurement][rows[0]]) if known else math.nan
@@ -184,7 +184,7 @@ class Run:
     def mean_until(
         self, measurement: str, budget: float, cost: Callable[[Run], Column] | None = None
     ) -> float:
-        """Mean of a measurement along training; NaN for a run that did not spend the budget.
+        """Returns the mean of a measurement along training; NaN if the budget was not spent.
 
         Args:
             measurement: linear between two evaluations.
@@ -201,7 +201,7 @@ class Run:
         return float(np.trapezoid(y, x) / (x[-1] - x[0])) if len(x) > 1 else end
 
     def shares(self, cycle: Record) -> Column | None:
-        """Shares of a cycle's proposals, a dimension for each axis; None if not recorded."""
+        """Returns a cycle's shares of proposals, a dimension for each axis; None if unrecorded."""
         sides = tuple(len(values) for values in self.task.space.values())
         try:
             counts = np.asarray(cycle.get("histogram"), float)
@@ -213,12 +213,12 @@ class Run:
 
 
 def share_map(shares: Column) -> Column:
-    """Shares over the first axis (rows) and the second (columns); of one axis a single row."""
+    """Returns shares over the first axis (rows) and the second (columns); one row for one axis."""
     return np.atleast_2d(shares.sum(tuple(range(2, shares.ndim))))
 
 
 def tables(runs: Iterable[tuple[str, Run]], key: str = "run") -> dict[str, pd.DataFrame]:
-    """What runs recorded, as tables.
+    """Returns what runs recorded as tables, a row for each moment, cycle or level.
 
     Args:
         runs: each with the name that its rows carry.
@@ -257,7 +257,7 @@ def tables(runs: Iterable[tuple[str, Run]], key: str = "run") -> dict[str, pd.Da
 
 
 def to_csv(table: pd.DataFrame) -> bytes:
-    """A table as CSV; whole numbers without a point, an empty cell where there is none."""
+    """Returns a table as CSV; whole numbers without a point, NaN as an empty cell."""
     text: str = table.to_csv(
         index=False, lineterminator="\n", float_format=lambda x: repr(float(x)).removesuffix(".0")
     )

@@ -54,7 +54,7 @@ class Estimate(NamedTuple):
     freedom: float
 
     def interval(self, confidence: float = CONFIDENCE) -> Interval:
-        """Student's interval."""
+        """Returns Student's confidence interval."""
         half = self.error * float(special.stdtrit(self.freedom, (1 + confidence) / 2))
         return Interval(self.value, self.value - half, self.value + half)
 
@@ -65,7 +65,7 @@ class Estimate(NamedTuple):
 
 
 def mean_of(values: Values) -> Estimate:
-    """Mean of independent values.
+    """Returns the mean of independent values, with its standard error and degrees of freedom.
 
     The degrees of freedom are n minus the number of runs that share the most common value: n - 1
     where all differ, and less where runs are cut off at a horizon, whose spread the others must
@@ -79,7 +79,7 @@ def mean_of(values: Values) -> Estimate:
 
 
 def difference_of(one: Values, other: Values, paired: bool = False) -> Estimate:
-    """Difference of two means, ``one`` minus ``other``.
+    """Returns the difference of two means, ``one`` minus ``other``.
 
     Args:
         one: independent values.
@@ -92,36 +92,42 @@ def difference_of(one: Values, other: Values, paired: bool = False) -> Estimate:
     value = float(a.mean() - b.mean())
     if min(len(a), len(b)) < FEWEST or np.ptp(a) == np.ptp(b) == 0:
         return Estimate(value, math.nan, 1.0)
-    squares = [x.var(ddof=1) / len(x) for x in (a, b)]
-    parts = [square**2 / (len(x) - 1) for square, x in zip(squares, (a, b), strict=True)]
-    return Estimate(value, math.sqrt(sum(squares)), float(sum(squares) ** 2 / sum(parts)))
+    return _of_sum(value, [x.var(ddof=1) / len(x) for x in (a, b)], [len(a) - 1, len(b) - 1])
 
 
 def mean_of_estimates(found: Sequence[Estimate]) -> Estimate:
-    """Mean of independent estimates, which count alike: their squared errors add up.
+    """Returns the mean of independent estimates, which count alike.
 
-    With Satterthwaite's degrees of freedom (Biometrics Bulletin 2, 1946). Without an error where
-    one is not known, or none has any.
+    Its error is NaN where one of theirs is not known, or none has any.
     """
     value = float(np.mean([one.value for one in found]))
     squares = [one.error**2 for one in found]
     if not sum(squares) > 0:
         return Estimate(value, math.nan, 1.0)
-    parts = [square**2 / one.freedom for square, one in zip(squares, found, strict=True)]
-    return Estimate(value, math.sqrt(sum(squares)) / len(found), sum(squares) ** 2 / sum(parts))
+    of_sum = _of_sum(value, squares, [one.freedom for one in found])
+    return of_sum._replace(error=of_sum.error / len(found))
 
 
 def balanced(one: Values, other: Values) -> Estimate:
-    """Welch's difference if both had as many values as the fewer, and the variances seen."""
+    """Returns Welch's difference as if both had as many values as the fewer."""
     a, b = (np.asarray(values, dtype=float) for values in (one, other))
-    count, variances = min(len(a), len(b)), np.array([a.var(ddof=1), b.var(ddof=1)])
-    whole, squares = float(variances.sum()), float((variances**2).sum())
-    freedom = whole**2 / squares * (count - 1)
-    return Estimate(float(a.mean() - b.mean()), math.sqrt(whole / count), freedom)
+    count = min(len(a), len(b))
+    squares = [x.var(ddof=1) / count for x in (a, b)]
+    return _of_sum(float(a.mean() - b.mean()), squares, [count - 1] * 2)
+
+
+def _of_sum(value: float, squares: Sequence[float], freedoms: Sequence[float]) -> Estimate:
+    """Returns an estimate whose squared error is the sum of independent ones.
+
+    Its degrees of freedom are Satterthwaite's (Biometrics Bulletin 2, 1946).
+    """
+    whole = float(sum(squares))
+    parts = [square**2 / freedom for square, freedom in zip(squares, freedoms, strict=True)]
+    return Estimate(value, math.sqrt(whole), whole**2 / float(sum(parts)))
 
 
 def median_of(values: Values) -> tuple[Any, Any, Any]:
-    """Median of independent values, with an interval that holds for every law.
+    """Returns the median of independent values, with an interval that holds for every law.
 
     The interval goes from the k-th lowest value to the k-th highest, of the narrowest such that
     hold the law's median with a probability of at least :data:`HELD`, since each value is below it
@@ -146,19 +152,19 @@ def median_of(values: Values) -> tuple[Any, Any, Any]:
 
 
 def median_interval(values: Values) -> Interval:
-    """Median of independent values with its interval: see :func:`median_of`."""
+    """Returns the median of independent values with its interval: see :func:`median_of`."""
     return Interval(*map(float, median_of(values)))
 
 
 def interquartile_mean(values: Values) -> float:
-    """Mean without the lowest and the highest quarter (Agarwal et al., NeurIPS 2021)."""
+    """Returns the mean of the middle half of the values (Agarwal et al., NeurIPS 2021)."""
     return float(stats.trim_mean(np.asarray(values, dtype=float), QUARTER, axis=None))
 
 
 def jackknife(
     statistic: Callable[[NDArray[np.float64]], float], rows: NDArray[np.float64]
 ) -> Interval:
-    """A statistic of independent rows, with the jackknife's interval over them.
+    """Returns a statistic of independent rows, with the jackknife's interval over them.
 
     Student's interval of the pseudo-values n θ - (n - 1) θ without row i (Tukey, Annals of
     Mathematical Statistics 29, 1958).
@@ -176,7 +182,7 @@ def jackknife(
 
 
 def probability_of_improvement(one: Values, other: Values) -> Interval:
-    """How probable it is that a run of ``one`` has a greater value than a run of ``other``.
+    """Returns the probability that a run of ``one`` has a greater value than one of ``other``.
 
     P(X > Y) + P(X = Y) / 2 over all pairs: the Mann-Whitney statistic over the number of pairs
     (Agarwal et al., NeurIPS 2021). Its variance is at most θ (1 - θ) / min(n, m), whatever the laws
@@ -195,7 +201,7 @@ def probability_of_improvement(one: Values, other: Values) -> Interval:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """p-values corrected for their number (Holm, Scandinavian Journal of Statistics 6, 1979).
+    """Returns p-values corrected for their number (Holm, Scandinavian J. of Statistics 6, 1979).
 
     Who calls them significant at 5 % is wrong about any of them in at most 5 % of the cases. NaN,
     where nothing could be tested, stays and does not count.
@@ -209,9 +215,9 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def seeds_needed(difference: Estimate, seeds: int, level: float) -> int | None:
-    """More seeds, with which a difference as large as the one seen would be found, about.
+    """Returns about how many seeds would show a difference as large as the one seen.
 
-    With a power of 80 %: the two quantiles of Student's distribution, of the test and of the power,
+    The power is 80 %. The two quantiles of Student's distribution, of the test and of the power,
     add up to the difference in standard errors, which fall with the root of the number of seeds
     (Cohen, Statistical Power Analysis, 1988).
 

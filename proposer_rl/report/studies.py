@@ -126,16 +126,16 @@ class Study:
 
     @property
     def baseline(self) -> Group:
-        """What the others are measured against: the chosen one, the usual one, or the first."""
+        """The group that others are compared with: the chosen one, the usual one, or the first."""
         return self.group(self.chosen or "") or self.group(USUAL_BASELINE) or self.compared[0]
 
     def scores(self, group: Group, name: str) -> Column | None:
-        """What a group's runs of full length reach on each level, [runs, levels]; else None."""
+        """Returns what runs of full length reach on each level, [runs, levels]; None without."""
         rows = [run.levels[name] for run in self.tellers(group, name)]
         return np.array(rows) if rows else None
 
     def tellers(self, group: Group, name: str) -> list[Run]:
-        """A group's runs of full length that have as many levels as the study's first."""
+        """Returns a group's runs of full length with as many levels as the study's first run."""
         counts = [len(run.levels[name]) for run in self.runs if self._tells(run, name)]
         own = [run for run in group.runs if self._tells(run, name)]
         return [run for run in own if len(run.levels[name]) == counts[0]]
@@ -144,14 +144,14 @@ class Study:
         return name in run.levels and run.updates == self.horizon
 
     def group(self, label: str) -> Group | None:
-        """The group of that label among those that are compared, if it is there."""
+        """Returns the compared group of that label; None if it is not there."""
         return next((group for group in self.compared if group.label == label), None)
 
 
 def read_studies(
     folders: Iterable[Path], threshold: float | None, baseline: str | None = None
 ) -> tuple[list[Study], list[str]]:
-    """Read runs and sort them into studies.
+    """Reads runs and sorts them into studies.
 
     Returns:
         The studies, the largest first, and a line for each folder that was left out.
@@ -186,7 +186,7 @@ def read_studies(
 
 
 def _setting(run: Run) -> dict[str, Any]:
-    """All that must be equal for two runs to be measured alike."""
+    """Returns everything that must be equal for two runs to be measured alike."""
     return {
         "scale": run.config.get("scale"),
         "measured": run.task.measured,
@@ -196,9 +196,9 @@ def _setting(run: Run) -> dict[str, Any]:
 
 
 def _variant(run: Run) -> dict[str, Any]:
-    """All that the outcome of a run may depend on, but for the seed.
+    """Returns everything that a run's outcome may depend on, apart from its seed.
 
-    Of the settings alone, so that a run counts where it will when it is finished.
+    It consists of settings alone, so that an unfinished run is in the group of its finished ones.
     """
     ignored = {"seed", "seeds", "schedule", "checkpoint"}  # the curriculum has the last
     # Proposers that differ in their seed alone are as much a matter of chance as Solvers.
@@ -209,7 +209,7 @@ def _variant(run: Run) -> dict[str, Any]:
 
 
 def _without_seeds(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings with ``*`` for the seeds in the folders of checkpoints."""
+    """Returns settings with ``*`` for the seeds in the folders of checkpoints."""
     found: dict[str, Any] = {}
     for key, value in settings.items():
         if isinstance(value, Mapping):
@@ -267,10 +267,10 @@ def _plain_label(run: Run) -> str:
 
 
 def _labels(plain: str, alike: Sequence[Sequence[Run]]) -> list[tuple[str, str]]:
-    """Labels of variants of one name, each with the settings in which it differs from the others.
+    """Returns labels of variants of one name, and the settings in which each differs.
 
-    As they were written on the command line, or else as they stand in the configurations. Where
-    these are few they are the label, else the variants are numbered.
+    Settings are as on the command line, or else as in the configurations. Short ones are part of
+    the label; otherwise the variants are numbered.
     """
     if len(alike) == 1:
         return [(plain, "")]
@@ -292,7 +292,7 @@ def _labels(plain: str, alike: Sequence[Sequence[Run]]) -> list[tuple[str, str]]
 
 
 def _overrides(run: Run) -> list[str] | None:
-    """What a run was started with, but for its method and what does not change its outcome."""
+    """Returns a run's overrides without its method and those that leave its outcome alone."""
     given = run.facts.get("overrides")
     if not isinstance(given, list) or not all(isinstance(word, str) for word in given):
         return None

@@ -39,16 +39,16 @@ class Table:
         return list(self.rows[0]) if self.rows else []
 
     def texts(self) -> list[list[str]]:
-        """The cells as a reader sees them."""
+        """Returns the cells as text for a reader, [rows][columns]."""
         return [[write(cell) for cell in row.values()] for row in self.rows]
 
     def to_markdown(self) -> str:
-        """A table of GitHub's Markdown."""
+        """Returns the table in GitHub's Markdown."""
         lines = [self.columns, ["---"] * len(self.columns), *self.texts()]
         return "".join(f"| {' | '.join(map(escape_markdown, line))} |\n" for line in lines)
 
     def to_csv(self) -> str:
-        """The numbers behind the cells; an interval takes three columns."""
+        """Returns the cells' numbers as CSV; an interval takes three columns."""
         columns: dict[str, list[Any]] = {}
         for name in self.columns:
             cells = [row[name] for row in self.rows]
@@ -60,7 +60,7 @@ class Table:
 
 
 def to_csv(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """CSV as spreadsheets and pandas read it; floats with six significant digits."""
+    """Returns CSV for spreadsheets and pandas; floats have six significant digits."""
     file = io.StringIO()
     csv.writer(file, lineterminator="\n").writerows(
         [_csv_cell(cell) for cell in row] for row in (header, *rows)
@@ -69,12 +69,12 @@ def to_csv(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 
 def from_csv(text: str) -> str:
-    """A text as it was before :func:`to_csv` kept spreadsheets from taking it for a formula."""
+    """Returns a text without the quote by which :func:`to_csv` keeps it from being a formula."""
     return text[1:] if text.startswith(tuple(f"'{begin}" for begin in FORMULA)) else text
 
 
 def write(cell: Cell, digits: int | None = None) -> str:
-    """A cell as a reader sees it; where no digits are given, with what its size asks for."""
+    """Returns a cell as text; without ``digits`` as many as suit the size of the number."""
     if isinstance(cell, Interval):
         if digits is None:
             digits = 1 if max(map(abs, cell)) >= 2 else 3
@@ -94,7 +94,7 @@ def write(cell: Cell, digits: int | None = None) -> str:
 
 
 def escape_markdown(text: str) -> str:
-    """Text that Markdown shows as it is, on one line."""
+    """Returns text on one line that Markdown shows as it is."""
     for character in "\\|<>`*_[]":
         text = text.replace(character, f"\\{character}")
     return " ".join(text.split())

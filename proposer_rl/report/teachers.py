@@ -55,7 +55,7 @@ class Log(NamedTuple):
 
 
 def write_teachers(files: Sequence[Path], output: Path) -> Path:
-    """Write a page of some logs into a folder.
+    """Writes a page of some logs into a folder, and returns its path.
 
     Raises:
         UnreadableRun: for a file that is no such log.
@@ -63,8 +63,9 @@ def write_teachers(files: Sequence[Path], output: Path) -> Path:
     """
     logs = {}
     for file in files:
-        label = file.stem if file.stem not in logs else str(file)
-        logs[printable(label)[:80]] = read_log(file)
+        name = printable(file.stem)[:80]
+        # What tells two paths from each other stands rather at their ends.
+        logs[name if name not in logs else printable(str(file))[-80:]] = read_log(file)
     check_output(output, PAGE, "report.html")
     output.mkdir(parents=True, exist_ok=True)
     figures = [
@@ -76,7 +77,7 @@ def write_teachers(files: Sequence[Path], output: Path) -> Path:
 
 
 def read_log(file: Path) -> Log:
-    """A log from its file, which may come from anybody.
+    """Reads a log from a file, which is not trusted.
 
     Raises:
         UnreadableRun: naming the file.
@@ -106,7 +107,7 @@ def read_log(file: Path) -> Log:
 
 
 def drawings(logs: Mapping[str, Log]) -> list[Drawing]:
-    """The entries of all logs side by side, and of each what was drawn."""
+    """Returns figures: the entries of all logs side by side, and the levels of each."""
     named = looks(logs)
     names = dict.fromkeys(name for log in logs.values() for name in log.entries)
     panels = [partial(_draw_entry, logs=logs, name=name, named=named) for name in names]
@@ -160,7 +161,7 @@ def _draw_map(figure: FigureBase, log: Log, name: str) -> None:
 
 
 def _mean(value: Any) -> float:
-    """A number, or the mean of nested ones; NaN of anything else."""
+    """Returns a number, or the mean of nested ones; NaN of anything else."""
     if isinstance(value, list):
         known = [one for one in map(_mean, value) if not math.isnan(one)]
         return sum(known) / len(known) if known else math.nan

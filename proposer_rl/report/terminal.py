@@ -46,7 +46,7 @@ STOPPED = 128  # a greater exit code is that of a signal: the run can go on
 
 
 def duration(seconds: float) -> str:
-    """Seconds in the unit that reads best."""
+    """Returns seconds as text in the unit that reads best."""
     for unit, size in (("d", 86400), ("h", 3600), ("min", 60)):
         if seconds >= 2 * size:
             return f"{seconds / size:.0f} {unit}"
@@ -74,7 +74,7 @@ class Progress:
 
     @property
     def state(self) -> str:
-        """In a word: failed, finished, unfinished (running or interrupted) or starting."""
+        """The state in a word: failed, finished, unfinished (or running), or starting."""
         if self.failure:
             return "failed"
         if not self.runs:
@@ -83,7 +83,7 @@ class Progress:
 
 
 def read_progress(folder: Path) -> Progress:
-    """The state of a run's folder, whatever of it is there yet."""
+    """Returns the state of a run's folder, also of one without measurements."""
     failure = _failure(folder)
     try:
         runs = tuple(read_run(folder))
@@ -98,7 +98,7 @@ def read_progress(folder: Path) -> Progress:
 
 
 def find_progress(folder: Path) -> list[Progress]:
-    """The states of all runs in a folder, or of the folder itself."""
+    """Returns the states of all runs in a folder, or of the folder itself."""
     found = [read_progress(path) for path in begun(folder)]
     if not found:
         raise UnreadableRun(f"{folder}: no run in it, finished or begun")
@@ -117,7 +117,7 @@ def _failure(folder: Path) -> str:
 
 
 def _doing(folder: Path) -> str:
-    """What a run says that it is doing; empty where it is over or the file cannot be read."""
+    """Returns a run's present activity; empty where it is over or the file cannot be read."""
     match small_json(folder / PROGRESS, 2**12):
         case {"doing": str(text)}:
             return printable(text)[:LONGEST_TEXT]
@@ -125,7 +125,7 @@ def _doing(folder: Path) -> str:
 
 
 def _left(run: Run) -> str:
-    """How long the rest takes if each update takes as long as those so far; empty before one."""
+    """Returns how long the rest takes at the mean speed so far; empty before the first update."""
     if not run.updates or run.planned is None:
         return ""
     rest = run.last("seconds") / run.updates * (run.planned - run.updates)
@@ -144,7 +144,7 @@ def _seconds_since(folder: Path) -> float:
 
 
 def screen(progress: Progress) -> RenderableType:
-    """One run: how far it is, its curves, its last cycle, and what it trains on."""
+    """Returns one run's state, curves, last cycle and levels as a panel for the terminal."""
     head = Text.assemble((progress.state, COLOURS[progress.state]), f", {_age(progress)}")
     if progress.activity:
         head.append(f": {progress.activity}")
@@ -162,7 +162,7 @@ def screen(progress: Progress) -> RenderableType:
 
 
 def overview(found: Sequence[Progress]) -> RenderableType:
-    """Several runs: one line each, and how many are in which state."""
+    """Returns a table with a line for each run, and the number of runs in each state."""
     parent = os.path.commonpath([progress.folder.parent for progress in found])
     names = [printable(str(progress.folder.relative_to(parent))) for progress in found]
     table = Table(box=None, pad_edge=False)
@@ -193,7 +193,7 @@ def overview(found: Sequence[Progress]) -> RenderableType:
 
 
 def sparkline(values: Iterable[float], low: float, high: float) -> str:
-    """Values as blocks of rising height; values outside are drawn at the edge."""
+    """Returns values as blocks of rising height; values outside are drawn at the edge."""
     span = (high - low) or 1.0
     steps = [(value - low) / span * (len(BLOCKS) - 1) for value in values]
     return "".join(BLOCKS[min(max(round(step), 0), len(BLOCKS) - 1)] for step in steps)
@@ -235,7 +235,7 @@ def _curves(runs: Sequence[Run]) -> RenderableType:
 
 
 def _cycles(run: Run) -> list[RenderableType]:
-    """The gains of the replicas or else the curriculum's numbers, its shares and proposals."""
+    """Returns gains of replicas, or else the curriculum's numbers, then shares and proposals."""
     cycle, grid = run.cycles[-1], Table.grid(padding=(0, 1))
     for name, text in GAINS.items():
         gains = [found for c in run.cycles if (found := numbers(c.get(name))) is not None]
@@ -248,7 +248,7 @@ def _cycles(run: Run) -> list[RenderableType]:
         values = [value for c in run.cycles if not math.isnan(value := number(c.get(name)))]
         if values:
             drawn = sparkline(_some(values), min(values), max(values))
-            grid.add_row(Text(words(name)), Text(drawn), f"{values[-1]:.4g}")
+            grid.add_row(Text(name.replace("_", " ")), Text(drawn), f"{values[-1]:.4g}")
     parts: list[RenderableType] = [grid]
     if batch := batch_shares(cycle):
         told = ", ".join(f"{name} {share:.0%}" for name, share in batch.items())
@@ -273,7 +273,7 @@ def _map(run: Run, shares: Column) -> list[RenderableType]:
 
 
 def _levels(run: Run) -> RenderableType:
-    """The first levels of the last recorded batch that can be drawn in characters."""
+    """Returns the first levels of the last recorded batch that can be drawn in characters."""
     sample = run.samples[-1]
     drawn = [Text("\n".join(level.text)) for level in sample.levels[:LEVELS] if level.text]
     if not drawn:
@@ -284,7 +284,7 @@ def _levels(run: Run) -> RenderableType:
 
 
 def _some(values: Sequence[float] | Column) -> Sequence[float] | Column:
-    """Values, or as many of them as a curve has characters."""
+    """Returns the values, or as many of them, evenly spaced, as a curve has characters."""
     if len(values) <= WIDTH:
         return values
     return np.asarray(values)[np.linspace(0, len(values) - 1, WIDTH).round().astype(int)]

@@ -91,7 +91,7 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: State, kee
 
 
 def checkpoint_bytes(step: int, state: State) -> bytes:
-    """A checkpoint as a file's content; see :func:`save_checkpoint`."""
+    """Returns a checkpoint as a file's content; see :func:`save_checkpoint`."""
     payload = io.BytesIO()
     torch.save(_plain(state, "state"), payload)
     body = json.dumps({"format": FORMAT, "step": step}).encode() + b"\n" + payload.getvalue()

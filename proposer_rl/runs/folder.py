@@ -102,7 +102,7 @@ class RunFolder:
         _sync_folder(self.path)
 
     def write_json(self, name: str, value: object) -> None:
-        """Writes a JSON file; whoever reads it sees the old content or the new, never a part."""
+        """Writes a JSON file; a reader sees the old content or the new, never a part."""
         path = self.path / name
         write_atomically(path, (_json(path, value, indent=2) + "\n").encode())
 
@@ -116,17 +116,17 @@ class RunFolder:
 
 
 def is_rate(name: str) -> bool:
-    """Whether a column holds shares from 0 to 1, as success is."""
+    """Returns whether a column holds shares from 0 to 1, as success is."""
     return "success" in name.split("_")
 
 
 def can_reach(name: str, threshold: float) -> bool:
-    """Whether a threshold makes sense for a column: a rate is above 0 and at most 1."""
+    """Returns whether a column can reach a threshold: a rate is above 0 and at most 1."""
     return not is_rate(name) or 0 < threshold <= 1
 
 
 def read_csv(path: str | os.PathLike[str]) -> list[dict[str, Number]]:
-    """The complete rows of a ``.csv`` table, as they were given to :meth:`RunFolder.append`."""
+    """Returns the complete rows of a ``.csv`` table, as :meth:`RunFolder.append` was given them."""
     rows: list[dict[str, Number]] = []
     lines = _lines(Path(path))
     header = next(lines, ("", ""))[1].split(",")
@@ -139,7 +139,7 @@ def read_csv(path: str | os.PathLike[str]) -> list[dict[str, Number]]:
 
 
 def read_jsonl(path: str | os.PathLike[str]) -> list[dict[str, object]]:
-    """The complete rows of a ``.jsonl`` table; a ValueError for a line that is no JSON object."""
+    """Returns the complete rows of a ``.jsonl`` table; a ValueError names any other line."""
     rows = []
     for place, line in _lines(Path(path)):
         try:
@@ -180,7 +180,7 @@ def write_atomically(path: Path, content: bytes, durably: bool = True) -> None:
 
 
 def read_bounded(path: Path, largest: int) -> bytes:
-    """A file that may come from anybody.
+    """Returns the content of a file that is not trusted.
 
     Raises:
         ValueError: if it has more than ``largest`` bytes, or is no file but a pipe or a device,
@@ -198,7 +198,7 @@ def read_bounded(path: Path, largest: int) -> bytes:
 
 @contextmanager
 def storage(path: Path, action: str = "write") -> Iterator[None]:
-    """Names the file in whatever error of the operating system arises inside.
+    """Turns any error of the operating system inside into one that names the file.
 
     Raises:
         StorageError: instead of any other OSError.
@@ -210,7 +210,7 @@ def storage(path: Path, action: str = "write") -> Iterator[None]:
 
 
 def _csv(path: Path, row: Mapping[str, object], header: str | None) -> str:
-    """A row as text, in the order of the header; with a header of its own if there is none yet."""
+    """Returns a row as text, in the header's order; with a header if there is none yet."""
     columns = list(row) if header is None else header.split(",")
     if set(row) != set(columns):
         missing, unknown = sorted(set(columns) - set(row)), sorted(set(row) - set(columns))
@@ -259,7 +259,7 @@ def _lines(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _first_line(path: Path) -> str | None:
-    """The first line of a table whose last one is complete; None if there is no line yet."""
+    """Returns the first line of a table whose last one is complete; None without a line."""
     if not path.exists() or not path.stat().st_size:
         return None
     with open(path, "rb") as file:
@@ -271,7 +271,7 @@ def _first_line(path: Path) -> str | None:
 
 
 def _row_ends(path: Path) -> list[int]:
-    """Where in a table each complete row ends, in bytes."""
+    """Returns where in a table each complete row ends, in bytes."""
     with open(path, "rb") as file:
         ends = list(accumulate(len(line) for line in file if line.endswith(b"\n")))
     return ends[1:] if path.suffix == ".csv" else ends

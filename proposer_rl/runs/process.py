@@ -39,7 +39,7 @@ class Interrupted(Exception):
 
     @property
     def exit_code(self) -> int:
-        """That of a process which the signal ends, as shells have it."""
+        """The exit code of a process that the signal ends, as in shells."""
         return 128 + self.signum
 
 
@@ -48,7 +48,7 @@ class StopRequested(Exception):
 
 
 class StopSignals:
-    """Inside this context a stop signal is kept until the run comes to a safe point.
+    """A context in which a stop signal is kept until the run comes to a safe point.
 
     A second SIGINT is not kept: it raises KeyboardInterrupt at once. A signal that is ignored (as
     ``nohup`` has it) stays so. Outside of the main thread nothing is changed, since Python delivers
@@ -77,7 +77,7 @@ class StopSignals:
         return self._pending is not None
 
     def check(self) -> None:
-        """Interrupt long work that can be repeated.
+        """Interrupts long work that can be repeated.
 
         Raises:
             StopRequested: if a signal has come.
@@ -86,7 +86,7 @@ class StopSignals:
             raise StopRequested
 
     def deliver(self) -> None:
-        """Act on the signal that has come: to be called once all is saved.
+        """Acts on the signal that has come: to be called once all is saved.
 
         A handler that was there before this context is called, such as submitit's, which puts the
         job into the queue again and exits; if it returns, the run goes on.
@@ -116,7 +116,7 @@ class StopSignals:
 
 
 def _shield_tracker() -> None:
-    """Start Python's resource tracker with stop signals blocked for good, unless it runs already.
+    """Starts Python's resource tracker, if it does not run, with stop signals blocked.
 
     Slurm signals every process of a step. The tracker, which tqdm's lock brings, would die of most,
     and its successor complain in tracebacks of what it does not know.
@@ -136,7 +136,7 @@ class InUseError(RuntimeError):
 
 @contextmanager
 def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
-    """Keep other processes out of a folder.
+    """Keeps other processes out of a folder.
 
     The operating system gives the lock up when the process ends, in whatever way: a lock of a dead
     process blocks nobody.
@@ -190,7 +190,7 @@ class Status:
 
     @contextmanager
     def of_run(self, folder: Path, show: Callable[[], None]) -> Iterator[None]:
-        """While a run goes on, report it in its folder, and call ``show`` as often."""
+        """Reports a run's activity in its folder while inside, and calls ``show`` as often."""
         self._folder, self._show = folder, show
         try:
             yield
@@ -202,7 +202,7 @@ class Status:
                 (folder / PROGRESS).unlink()
 
     def tell(self, doing: str, part: int = 0) -> None:
-        """Say what the run does, and how many parts of it are done; 0 where it has none."""
+        """Reports what the run does, and how many parts of it are done; 0 where it has none."""
         self.doing = f"{doing} {min(part, self._parts)}/{self._parts}" if part else doing
         now = self._clock()
         if self._folder is None or now - self._told < EVERY:
@@ -214,7 +214,7 @@ class Status:
 
 
 def processor() -> str:
-    """The processor's name, or else its kind."""
+    """Returns the processor's name, or else its kind."""
     information = Path("/proc/cpuinfo")
     if information.exists():
         for line in information.read_text(encoding="utf-8").splitlines():
@@ -224,7 +224,7 @@ def processor() -> str:
 
 
 def memory() -> int:
-    """Bytes that this process can have: the machine's, or what a container or Slurm allows."""
+    """Returns the bytes that this process may use, by the machine and its container."""
     whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     with suppress(OSError, ValueError):  # "max", or no such file
         return min(whole, int(Path("/sys/fs/cgroup/memory.max").read_text()))

@@ -61,7 +61,7 @@ Sheets = Annotated[dict[Name, list[LevelRecord]], Field(max_length=16)]
 
 
 class LevelResults(BaseModel):
-    """What a seed reached on every level of a distribution."""
+    """A seed's results on every level of a distribution."""
 
     updates: int
     seed: int
@@ -79,7 +79,7 @@ class SampleRecord(BaseModel):
 
 
 class TaskFacts(BaseModel):
-    """What a run says of its task, for a reader.
+    """A run's description of its task, for its readers.
 
     Attributes:
         title: what it is, as ``6×6 mazes``.
@@ -110,7 +110,7 @@ class TaskFacts(BaseModel):
 
 
 def checked(kind: type[T], value: Any, where: str) -> T:
-    """A value from a file or a request as it should be; bytes are its JSON.
+    """Returns a value from a file or a request, validated; bytes are read as JSON.
 
     Raises:
         ValueError: with the place of the first thing that is not so.
@@ -126,7 +126,7 @@ def checked(kind: type[T], value: Any, where: str) -> T:
 
 
 def small_json(path: Path, largest: int = 2**20) -> Any:
-    """What a small file of a run says; None where it is none that can be read."""
+    """Returns the content of a run's small JSON file; None if it cannot be read."""
     try:
         return None if path.is_symlink() else json.loads(read_bounded(path, largest))
     except (OSError, ValueError, RecursionError):
@@ -134,27 +134,27 @@ def small_json(path: Path, largest: int = 2**20) -> Any:
 
 
 def printable(text: str) -> str:
-    """A text as one line that can do nothing to a terminal."""
+    """Returns a text as one line without control characters."""
     return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
 
 
 def encoded(text: str) -> bytes:
-    """A text as UTF-8; what has no encoding, as half of a pair in a folder's name, becomes ?."""
+    """Returns a text as UTF-8, with ``?`` for what has no encoding, such as half of a pair."""
     return text.encode("utf-8", "replace")
 
 
 def from_here(text: str) -> str:
-    """Text whose paths inside the working folder begin there, as they do on any machine."""
+    """Returns text with paths inside the working folder made relative to it."""
     return re.sub(rf"(?<![\w./]){re.escape(str(Path.cwd()))}/", "", text)
 
 
 def anywhere(text: str) -> str:
-    """Text without the folders of the machine it comes from: of a whole path the last part."""
+    """Returns text with absolute paths cut to their last part, to be free of the machine."""
     return re.sub(r"(?<![\w./])/(?:[\w.\-]+/)+", "", text)
 
 
 def picture(encoded: Any) -> NDArray[np.uint8] | None:
-    """A picture that was recorded, uint8 [H, W, 3]; None where it is none that can be shown."""
+    """Returns a recorded picture, uint8 [H, W, 3]; None where it cannot be shown."""
     try:
         content = base64.b64decode(encoded, validate=True)
         with warnings.catch_warnings():
@@ -171,7 +171,7 @@ def picture(encoded: Any) -> NDArray[np.uint8] | None:
 
 
 def number(value: Any) -> float:
-    """A recorded number, of a list of numbers the mean; NaN where it is neither."""
+    """Returns a recorded number, of a list of numbers the mean; NaN where it is neither."""
     if isinstance(value, list):
         found = numbers(value)
         return math.nan if found is None else float(found.mean())
@@ -181,7 +181,7 @@ def number(value: Any) -> float:
 
 
 def numbers(value: Any) -> Column | None:
-    """A list of finite numbers; None where it is none."""
+    """Returns a list of finite numbers as an array [n]; None where it is none."""
     if not isinstance(value, list) or not value or any(isinstance(one, list) for one in value):
         return None
     found = np.array([number(one) for one in value])
@@ -189,9 +189,9 @@ def numbers(value: Any) -> Column | None:
 
 
 def batch_shares(record: Record) -> dict[str, float]:
-    """Returns the parts of batches that a curriculum's ``shares`` tell, by their names.
+    """Returns a record's ``shares`` of a batch by the names of its parts.
 
-    Of several students the mean; empty where a record has none.
+    A share is the mean over several students; the result is empty where a record has none.
     """
     told = record.get("shares")
     means = {name: number(own) for name, own in told.items()} if isinstance(told, Mapping) else {}
@@ -199,19 +199,19 @@ def batch_shares(record: Record) -> dict[str, float]:
 
 
 def words(name: str) -> str:
-    """A column in words: ``id_success`` is ID success."""
+    """Returns a column's name in words: ``id_success`` is ID success."""
     first, _, rest = name.partition("_")
     first = first.upper() if len(first) <= 3 else first
     return f"{first} {rest.replace('_', ' ')}".strip()
 
 
 def level_text(name: str, value: float) -> str:
-    """A value of a column as a reader wants it: 80% of a success, 0.8 of anything else."""
+    """Returns a column's value as text: 80% of a success, 0.8 of anything else."""
     return f"{100 * value:g}%" if is_rate(name) else f"{value:g}"
 
 
 def png(picture: NDArray[np.uint8]) -> str:
-    """A picture uint8 [H, W, 3] as PNG in base64; of many colours the most frequent are kept."""
+    """Returns a picture uint8 [H, W, 3] as PNG in base64, in its most frequent colours."""
     image = Image.fromarray(picture).quantize(COLOURS, dither=Image.Dither.NONE)
     file = io.BytesIO()
     image.save(file, "PNG", optimize=True)
@@ -219,13 +219,13 @@ def png(picture: NDArray[np.uint8]) -> str:
 
 
 def pixels(text: str) -> NDArray[np.uint8]:
-    """The picture uint8 [H, W, 3] that :func:`png` made a text of; only for texts of our own."""
+    """Returns the picture uint8 [H, W, 3] in a text of :func:`png`; only for texts of our own."""
     with Image.open(io.BytesIO(base64.b64decode(text)), formats=["PNG"]) as image:
         return np.asarray(image.convert("RGB"))
 
 
 def written(lines: Sequence[str]) -> NDArray[np.uint8]:
-    """Lines of text as a picture, uint8 [H, W, 3]."""
+    """Returns lines of text as a picture, uint8 [H, W, 3]."""
     image = Image.new("RGB", (WIDTH, 8 + 14 * len(lines)), (250, 250, 250))
     ImageDraw.Draw(image).multiline_text((4, 4), "\n".join(lines), (45, 45, 45))
     return np.asarray(image)

@@ -170,9 +170,10 @@ class Task(ABC):
     def network(self) -> nn.Module:
         """Returns one Solver's network, without buffers, drawn from torch's default generator.
 
-        Where :meth:`actor_critic` is not replaced: from what is ``observed``, [*B, ...] each, to
-        logits [*B, A], or locations and log-scales [*B, D, 2] of continuous actions, and values
-        [*B, 1]; with ``memory`` such as :class:`~proposer_rl.models.MemoryNetwork`.
+        It maps what is ``observed``, [*B, ...] each, to logits [*B, A], or locations and log-scales
+        [*B, D, 2] of continuous actions, and values [*B, 1]; with ``memory`` such as
+        :class:`~proposer_rl.models.MemoryNetwork`. It is used unless :meth:`actor_critic` is
+        overridden.
         """
 
     def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
@@ -351,7 +352,7 @@ class Task(ABC):
 
     @property
     def description(self) -> dict[str, Any]:
-        """What states of curricula are compared by, for JSON: the space's axes, and names."""
+        """The space's axes and the task's names, by which states are compared; for JSON."""
         return {
             "kind": type(self).__qualname__,
             "axes": {name: list(values) for name, values in self.space.axes.items()},

@@ -33,7 +33,7 @@ class NoSuccessError(ValueError):
 
 
 class ComputeContext(NamedTuple):
-    """Where and how exactly a task computes; what makes a task is called with one.
+    """The device and precision with which a task computes, given to what makes tasks.
 
     Attributes:
         device: where Solvers and levels live.
@@ -52,7 +52,7 @@ class ComputeContext(NamedTuple):
 
 
 class Distribution(Protocol):
-    """Levels to draw from."""
+    """A distribution of levels."""
 
     def sample(self, count: int, generator: torch.Generator, /) -> Levels:
         """Draws levels [count] on the task's device; the generator is one of the CPU."""
@@ -81,7 +81,7 @@ class Space(Distribution, Protocol):
 
 
 class LevelResult(NamedTuple):
-    """What one Solver reaches on one level, as ``bin/eval`` lists it.
+    """One Solver's results on one level, as ``bin/eval`` lists them.
 
     Attributes:
         level: the level's name.
@@ -139,7 +139,7 @@ class EditableTask(Protocol):
 
 
 class CellKind(NamedTuple):
-    """What a cell of a drawing can be.
+    """A kind of cell in a drawing.
 
     Attributes:
         mark: its character.
@@ -157,7 +157,7 @@ class Board(Protocol):
 
     @property
     def kinds(self) -> Sequence[CellKind]:
-        """Of cells, the empty one first."""
+        """The kinds of cells, the empty one first."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -172,30 +172,30 @@ class Board(Protocol):
         """Names of the shipped sets of levels."""
 
     def read(self, rows: Sequence[str]) -> Levels:
-        """The level [] that is drawn.
+        """Returns the level [] that is drawn.
 
         Raises:
             ValueError: if it is none, or none for the Solvers of this task.
         """
 
     def draw(self, level: Levels) -> list[str]:
-        """The drawing of a level [], one text for each row; the inverse of :meth:`read`."""
+        """Returns the drawing of a level [], a text for each row; the inverse of :meth:`read`."""
 
     def drawing(self, record: Mapping[str, Any]) -> list[str]:
-        """The drawing of the level in one of the task's records."""
+        """Returns the drawing of the level in one of the task's records."""
 
     def level_set(self, name: str) -> Mapping[str, Levels]:
-        """The levels [] of one of the sets, by their names."""
+        """Returns the levels [] of one of the sets, by their names."""
 
     def read_file(self, text: str) -> Mapping[str, Levels]:
-        """The levels [] in the text of a file, by their names.
+        """Returns the levels [] in the text of a file, by their names.
 
         Raises:
             ValueError: if it is no such text.
         """
 
     def write_file(self, name: str, level: Levels) -> str:
-        """The text of a file with one level [].
+        """Returns the text of a file with one level [].
 
         Raises:
             ValueError: if the name or the level cannot stand in a file.
@@ -204,7 +204,7 @@ class Board(Protocol):
     def examine(
         self, agent: ActorCritic, solver: int, level: Levels, max_steps: int | None
     ) -> dict[str, Any]:
-        """What one of K Solvers does on a level [] with H x W cells, for JSON.
+        """Returns what one of K Solvers does on a level [] with H x W cells, for JSON.
 
         A way is a list of places: row and column, and where an agent turns its direction, too: 0
         right, 1 down, 2 left, 3 up.

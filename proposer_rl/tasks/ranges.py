@@ -37,7 +37,7 @@ RESERVED = {SEED, "updates", "train_success", "train_return", *OF_PPO}
 
 @settings
 class LineSettings:
-    """What values a parameter has.
+    """Settings of a parameter's values.
 
     Either ``values``, each of which is a bin, or a range from ``low`` to ``high`` in ``bins`` equal
     parts, within which it is drawn uniformly.

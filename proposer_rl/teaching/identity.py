@@ -29,14 +29,14 @@ def of_levels(space: Any, like: Levels) -> dict[str, Any]:
 
 
 def of_classes(curriculum: Curriculum) -> str:
-    """The name of a curriculum's class, and those of its parts."""
+    """Returns the name of a curriculum's class, and those of its parts."""
     parts = curriculum.parts if isinstance(curriculum, Combinator) else []
     within = f"({', '.join(map(of_classes, parts))})" if parts else ""
     return type(curriculum).__qualname__ + within
 
 
 def require_same(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Refuse the state of another one.
+    """Refuses a state that belongs to another space, task or curriculum.
 
     Raises:
         ArgumentError: naming what differs.

@@ -27,7 +27,7 @@ def make_curriculum(
     filter: Mapping[str, Any] | str | None,
     seeds: Sequence[int],
 ) -> tuple[Curriculum, dict[str, Any]]:
-    """The curriculum on the levels of a space or task; by name with the filter of its file.
+    """Returns the curriculum on the levels of a space or task; by name, with its file's filter.
 
     Returns:
         The curriculum; its name or class and all settings that were said of it, for JSON.

@@ -26,7 +26,7 @@ FEW = 32  # items of which it is too early to say that most are missing
 
 
 class Answer(NamedTuple):
-    """What came of an item: the success and return of an answer, or means of several."""
+    """The result of an item: success and return of an answer, or the means of several."""
 
     success: float
     return_: float

@@ -17,7 +17,7 @@ ANSWERS = 16.0  # that a pass rate is taken for the mean of
 
 
 class Table(NamedTuple):
-    """What is known of N items.
+    """The features of N items.
 
     Attributes:
         numbers: float or int64 [N, D]; of a column of texts a column for each of them, 0 or 1.

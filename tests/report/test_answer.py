@@ -93,6 +93,9 @@ def test_few_seeds_decide_nothing(tmp_path: Path) -> None:
 def test_a_method_alone_is_compared_with_nothing(tmp_path: Path) -> None:
     first, second = told(tmp_path, {"ours": 0.9})
     assert first.startswith("ours is the only method here") and "Nothing is compared" in second
+    write_run(tmp_path / "shorter", "plr", curve=[0.0, 0.1])
+    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
+    assert answer(study)[0].startswith("ours is the only method with runs of 20 updates")
 
 
 def test_what_a_method_does_is_what_its_run_recorded(tmp_path: Path) -> None:

@@ -20,7 +20,13 @@ from proposer_rl.cli.report import main
 from proposer_rl.cli.watch import main as watch
 from proposer_rl.report import build
 from proposer_rl.report.build import write_report
-from proposer_rl.report.figures import along_training, cost_curves, draw_run, side_by_side
+from proposer_rl.report.figures import (
+    along_training,
+    cost_curves,
+    draw_run,
+    learning_curves,
+    side_by_side,
+)
 from tests.report.folders import LEVEL, TASK, cycle, page_data, write_rockets, write_run
 
 HOSTILE = "<script>alert(1)</script>&\"'"
@@ -182,6 +188,26 @@ def test_what_cannot_be_reported_gets_one_line_and_leaves_all_as_it_was(
     assert end.value.code == 2 and message in line
     assert not usage or "nan" in message  # argparse shows how the command is used
     assert contents(tmp_path) == before
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_runs_that_have_measured_nothing_are_named(runs: Path, tmp_path: Path) -> None:
+    for name, file in (("begun", "config.json"), ("broken", "error.json")):
+        (runs / name).mkdir()
+        (runs / name / file).write_text("{}")
+    page = write_report([runs], tmp_path / "report", progress=False)
+    text = (page.parent / "report.md").read_text()
+    assert all(f"not read: {name}: it has measured nothing" in text for name in ("begun", "broken"))
+
+
+def test_a_run_that_has_just_begun_is_reported(
+    tmp_path: Path, recwarn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(build, "DRAWINGS", [learning_curves])
+    write_run(tmp_path / "a", curve=[0.1], finished=False)
+    page = write_report([tmp_path / "a"], tmp_path / "report", progress=False)
+    assert "target seed 0 (0 updates)" in (page.parent / "report.md").read_text()
+    assert [str(warning.message) for warning in recwarn] == []
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -93,6 +93,7 @@ def test_lines_and_bands_are_median_and_interval_of_the_files(
 def test_against_a_cost_runs_stand_between_their_measurements(
     runs: Path, data: dict[str, Any]
 ) -> None:
+    by_name(data["measures"], "ID success rate on the worst 10 %")
     measure = by_name(data["measures"], "ID success rate")
     costs = {
         FRAMES: lambda row: (row["frames"] + row["curriculum_frames"]) / 1e6,

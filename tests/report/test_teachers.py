@@ -12,6 +12,7 @@ import torch
 
 import proposer_rl as prl
 from proposer_rl.cli.report import main
+from proposer_rl.report import teachers
 from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.teachers import drawings, read_log
 
@@ -52,6 +53,28 @@ def test_shares_of_batches_are_entries_by_name(tmp_path: Path) -> None:
     (tmp_path / "x.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     found = read_log(tmp_path / "x.jsonl").entries
     np.testing.assert_allclose(found["share: way"], [0.3, np.nan])
+
+
+def test_logs_of_one_name_are_told_apart_however_long_their_paths_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: dict[str, object] = {}
+    monkeypatch.setattr(teachers, "drawings", lambda logs: shown.update(logs) or [])
+    files = [tmp_path / ("deep" * 30) / name / "x.jsonl" for name in "abc"]
+    for file in files:
+        file.parent.mkdir(parents=True)
+        file.write_text(json.dumps({"told": 4, "drawn": {}}) + "\n")
+    teachers.write_teachers(files, tmp_path / "page")
+    assert len(shown) == len(files) and "x" in shown
+
+
+@pytest.mark.parametrize("more", [["runs"], ["--threshold=0.5"], ["--baseline=target"]])
+def test_what_is_of_runs_is_refused_beside_a_log(
+    more: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["x.jsonl", *more, "-o", str(tmp_path / "page")])
+    assert end.value.code == 2 and "without runs, --threshold and --base" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

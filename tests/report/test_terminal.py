@@ -51,6 +51,11 @@ def test_shares_of_a_batch_are_a_line(tmp_path: Path, capsys) -> None:
     assert "of the batch" not in watch(capsys, str(tmp_path / "b"))
 
 
+def test_a_curriculums_own_numbers_are_called_as_it_calls_them(tmp_path: Path, capsys) -> None:
+    write_run(tmp_path / "run", cycles=[{"updates": 0, "new_levels": 3}])
+    assert "new levels" in watch(capsys, str(tmp_path / "run"))
+
+
 def test_seeds_of_which_one_is_a_row_ahead_are_drawn(tmp_path: Path, capsys) -> None:
     folder = write_run(tmp_path / "run", seeds=[0, 1], finished=False)
     table = folder / "metrics.csv"

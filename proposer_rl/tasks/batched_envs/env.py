@@ -25,7 +25,7 @@ Values = Mapping[str, Tensor]
 
 
 class Step(NamedTuple):
-    """What a step leads to, in an environment of batch shape [*B].
+    """The result of a step, in an environment of batch shape [*B].
 
     Attributes:
         state: float [*B, S], the next one.

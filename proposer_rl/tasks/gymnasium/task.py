@@ -43,7 +43,7 @@ from proposer_rl.tasks.ranges import spaces
 
 @settings
 class EvaluationSettings:
-    """How Solvers are measured: by episodes.
+    """Settings of how Solvers are measured: by episodes.
 
     Attributes:
         levels: of each distribution, the same in every run.

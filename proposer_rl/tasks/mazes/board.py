@@ -44,7 +44,7 @@ class Drawings:
         self.sets = level_files.shipped_sets()
 
     def read(self, rows: Sequence[str]) -> Any:
-        """The level that is drawn; see :class:`~proposer_rl.task.Board`."""
+        """Returns the level that is drawn; see :class:`~proposer_rl.task.Board`."""
         # The message of a drawing shows it; here it was seen already.
         try:
             level = self._task.level.from_text("\n".join(rows))
@@ -54,19 +54,19 @@ class Drawings:
         return level
 
     def draw(self, level: Level) -> list[str]:
-        """The rows of a level's drawing."""
+        """Returns the rows of a level's drawing."""
         return str(level.to_text()).splitlines()
 
     def level_set(self, name: str) -> Mapping[str, Level]:
-        """The levels of a shipped set; an agent that turns looks to the right."""
+        """Returns the levels of a shipped set; an agent that turns looks to the right."""
         return level_files.shipped_levels(name, self._task.level)
 
     def read_file(self, text: str) -> Mapping[str, Level]:
-        """The levels of a file's text; docs/how_to/levels.md has the format."""
+        """Returns the levels of a file's text; docs/how_to/levels.md has the format."""
         return level_files.levels_from_text(text, kind=self._task.level)
 
     def write_file(self, name: str, level: Level) -> str:
-        """A file's text; docs/how_to/levels.md has the format."""
+        """Returns a file's text; docs/how_to/levels.md has the format."""
         return level_files.levels_to_text({name: level})
 
 
@@ -85,7 +85,7 @@ class MazeBoard(Drawings):
     def examine(
         self, agent: ActorCritic, solver: int, level: Level, max_steps: int | None
     ) -> dict[str, Any]:
-        """What a Solver does on a level, exactly; see :class:`~proposer_rl.task.Board`.
+        """Returns what a Solver does on a level, exactly; see :class:`~proposer_rl.task.Board`.
 
         ``results``: ``success``, ``return`` and ``steps`` (expected) of the sampled policy.
         ``maps``: the critic's values; the probability of success from every cell with the whole
@@ -128,7 +128,7 @@ class MazeBoard(Drawings):
 
 
 def shortest_path(level: Level) -> list[list[int]] | None:
-    """A shortest path of a level ``[]``: its cells (row, column), start and goal included.
+    """Returns a shortest path of a level ``[]``: its cells (row, column), start to goal.
 
     Returns:
         Of several the one whose moves come first in
@@ -141,7 +141,7 @@ def shortest_path(level: Level) -> list[list[int]] | None:
 
 
 def _until_it_ends(path: list[list[int]], goal: list[int]) -> list[list[int]]:
-    """A path up to the goal, or to the first cell that is entered again: it circles from there."""
+    """Returns a path up to the goal, or to the first cell that is entered again."""
     seen: set[tuple[int, ...]] = set()
     for length, cell in enumerate(path, 1):
         if cell == goal or tuple(cell) in seen:
@@ -151,7 +151,7 @@ def _until_it_ends(path: list[list[int]], goal: list[int]) -> list[list[int]]:
 
 
 def _numbers(values: Tensor, without: Tensor) -> list[list[Any]]:
-    """Values ``[*A, H, W]`` as lists [H][W][*A]; None where ``without``, bool ``[H, W]``, is."""
+    """Returns values ``[*A, H, W]`` as lists [H][W][*A]; None in cells of ``without``."""
     rows = values.movedim((-2, -1), (0, 1)).double().round(decimals=DIGITS).tolist()
     return [
         [None if left_out else value for value, left_out in zip(row, line, strict=True)]

@@ -147,7 +147,7 @@ class SpecificationSpace(LevelDistribution):
     def coordinates(self) -> Tensor:
         """Returns each pair's fraction and length, scaled to [-1, 1]: float [M * N, 2].
 
-        Of an axis with a single value the coordinate is 0.
+        The coordinate on an axis with a single value is 0.
         """
         return torch.cartesian_prod(*self._scaled(*self.axes.values()))
 

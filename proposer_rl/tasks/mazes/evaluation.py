@@ -102,9 +102,9 @@ class ExactEvaluator:
 class RolloutEvaluator:
     """Mean return and share of successes over episodes played in :class:`MazeEnv`.
 
-    Of levels ``[*B, E]`` the random numbers are those of E levels, the same for every index of the
-    dimensions before: replicas of a Solver differ by what they do alone, and what one of them gets
-    does not depend on which others are evaluated with it.
+    Levels ``[*B, E]`` share the random numbers of E levels over all indices of ``*B``: replicas of
+    a Solver differ only by what they do, and the result of one does not depend on which others are
+    evaluated with it.
 
     Attributes:
         max_steps: Step limit of an episode.
@@ -310,7 +310,7 @@ def expected_visits(level: Level, policy: Tensor, max_steps: int) -> Tensor:
 def _presence(levels: Level, policy: Tensor, max_steps: int) -> Tensor:
     """Returns the probability that a step begins at every cell, 0 at the goal: [T, *B, H*W].
 
-    Of levels [*B] and action probabilities float [*B, 4, H*W].
+    Arguments are levels [*B] and action probabilities float [*B, 4, H*W].
     """
     width = levels.walls.shape[-1]
     start, goal = (cell_index(cell, width).unsqueeze(-1) for cell in (levels.start, levels.goal))

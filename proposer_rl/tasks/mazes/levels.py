@@ -21,7 +21,7 @@ WALL, FREE, START, GOAL = "#", ".", "S", "G"
 
 
 class LevelSpec(NamedTuple):
-    """What is asked of a level.
+    """The specification of a level.
 
     Attributes:
         obstacle_fraction: Obstacles per cell, in [0, 1); a grid of H x W cells has exactly

@@ -114,8 +114,8 @@ class LevelEnv(EnvBase):
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Sends the agents of finished mazes back to their starts.
 
-        As TorchRL's, but without asking a GPU first whether there are any, which would have to be
-        waited for.
+        It does what TorchRL's method does, without asking a GPU first whether there are any, which
+        would have to be waited for.
         """
         if self._waiting:
             return super().maybe_reset(tensordict)

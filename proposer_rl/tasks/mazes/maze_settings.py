@@ -72,7 +72,7 @@ class UNetSettings:
 
 @settings
 class MazeEvaluationSettings:
-    """How the Solver is measured, apart from its training.
+    """Settings of how the Solver is measured, apart from its training.
 
     Attributes:
         distributions: names of the distributions that are measured on.

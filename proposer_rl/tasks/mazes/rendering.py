@@ -81,7 +81,7 @@ def draw_level(
 
 
 def level_records(levels: Level, rollout: TensorDictBase | None) -> Iterator[dict[str, Any]]:
-    """Drawings of levels [n], with the Solver's first episode there [n, T] and its cells."""
+    """Draws levels [n], with the Solver's first episode there [n, T], as records."""
     levels = levels.cpu()
     for i, text in enumerate(levels.to_text()):
         path = None if rollout is None else _first_path(rollout[i])
@@ -97,7 +97,7 @@ def level_records(levels: Level, rollout: TensorDictBase | None) -> Iterator[dic
 
 
 def recorded_drawing(record: Mapping[str, Any]) -> list[str]:
-    """The rows of a level from its record, without what the Solver did there."""
+    """Returns the rows of a level from its record, without the Solver's path."""
     return [line.replace(" ", "").replace(EPISODE, FREE) for line in record["text"]]
 
 
@@ -110,7 +110,7 @@ def _first_path(steps: TensorDictBase) -> list[list[int]]:
 def _paint(
     picture: Tensor, place: Sequence[int], shape: Tensor, colour: tuple[int, int, int]
 ) -> None:
-    """Paint what a bool ``[cell, cell]`` covers of the cell at a row and column."""
+    """Paints what a bool ``[cell, cell]`` covers of the cell at a row and column."""
     cell = len(shape)
     top, left = (int(number) * cell for number in place)
     square = picture[top : top + cell, left : left + cell]

@@ -113,7 +113,7 @@ SIDE_PIXELS = 120  # pixels of a picture
 
 @settings
 class GateSettings:
-    """What differs between levels.
+    """Settings of what differs between levels.
 
     Attributes:
         position: of the gate's middle along the wall.

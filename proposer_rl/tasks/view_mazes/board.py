@@ -53,7 +53,7 @@ class ViewBoard(Drawings):
     def examine(
         self, agent: ActorCritic, solver: int, level: ViewLevel, max_steps: int | None
     ) -> dict[str, Any]:
-        """What a Solver does on a level, by playing; see :class:`~proposer_rl.task.Board`.
+        """Returns what a Solver does on a level, by playing; see :class:`~proposer_rl.task.Board`.
 
         ``results``: means over sampled episodes, those of ``bin/eval`` on a level named ``drawn``.
         """
@@ -87,7 +87,7 @@ class ViewBoard(Drawings):
 
 
 def _following(level: ViewLevel) -> list[list[int]]:
-    """Where each action leads, [3][H * W * 4]; cells row by row, each with four directions."""
+    """Returns where each action leads, [3][H * W * 4]; four directions for each cell."""
     moved = successors(level).tolist()  # [4][H * W], in the order of MOVES
     ahead = [moved[MOVES.index(step)] for step in AHEAD]
     cells, ways = range(len(moved[0])), range(len(AHEAD))
@@ -96,7 +96,7 @@ def _following(level: ViewLevel) -> list[list[int]]:
 
 
 def _shortest(level: ViewLevel, following: list[list[int]]) -> list[Node] | None:
-    """A way of fewest actions, start and goal included; None where there is none."""
+    """Returns a way of fewest actions, start and goal included; None where there is none."""
     width = level.walls.shape[1]
     start, goal = (int(cell_index(cell, width)) for cell in (level.start, level.goal))
     way = shortest_way(following, 4 * start + int(level.direction), lambda n: n // 4 == goal)

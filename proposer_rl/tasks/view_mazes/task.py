@@ -54,7 +54,7 @@ class ViewMazeSettings:
 
 @settings
 class ViewEvaluationSettings:
-    """How the Solver is measured, apart from its training; always by playing.
+    """Settings of how the Solver is measured, apart from its training; always by playing.
 
     Attributes:
         distributions: names of the distributions that are measured on.
