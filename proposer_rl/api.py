@@ -37,7 +37,7 @@ from proposer_rl.models import (
     ProposerNetwork,
     UNet,
 )
-from proposer_rl.recipes import DEFAULT_METHOD, Recipe, filter_content, override, recipe_function
+from proposer_rl.recipes import DEFAULT_METHOD, Recipe, filter_content, named_recipe, override
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
@@ -220,9 +220,9 @@ def train(
     from proposer_rl.cli.compose import compose_and_run
 
     if isinstance(task, str):
-        task = recipe_function("task", task)()
+        task = named_recipe("task", "task", task)
     if isinstance(curriculum, str):
-        curriculum = recipe_function("method", curriculum)()
+        curriculum = named_recipe("curriculum", "method", curriculum)
     overrides = [*task.overrides(), *curriculum.overrides()]
     if scale is not None:
         overrides.append(f"+scale={scale}")

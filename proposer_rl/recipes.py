@@ -113,6 +113,17 @@ def available(group: str, folder: Path = CONFIG_FOLDER) -> list[str]:
     return sorted(file.stem for file in (folder / group).glob("*.yaml"))
 
 
+def named_recipe(argument: str, group: Literal["task", "method"], name: str) -> Recipe:
+    """Returns what ``prl.curricula.NAME()`` or ``prl.tasks.NAME()`` gives.
+
+    Raises:
+        ArgumentError: naming the argument, if there is no such name.
+    """
+    if name not in available(group):
+        raise _refusal(f"{argument}={name!r}: must be one of {available(group)}")
+    return recipe_function(group, name)()
+
+
 def recipe_function(group: Literal["task", "method"], name: str) -> Callable[..., Recipe]:
     """The function ``prl.curricula.NAME`` or ``prl.tasks.NAME``, with its file's settings.
 

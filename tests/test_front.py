@@ -243,7 +243,7 @@ def test_what_cannot_be_imported_again_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("curriculum", "options", "message"),
     [
-        ("plrr", {}, "there is no 'plrr'; there are: accel, adaptive_mixture"),
+        ("plrr", {}, "curriculum='plrr': must be one of ['accel', 'adaptive_mixture'"),
         ("plr", {"scale": "tiny"}, "scale/tiny: unknown; choose one of"),
         ("plr", {"seed": "x"}, "seed='x': input should be a valid integer"),
         ("plr", {"updates": 0}, "schedule.updates=0: input should be greater than or equal to 1"),

@@ -14,10 +14,10 @@ from proposer_rl.recipes import (
     Recipe,
     filter_content,
     merged,
-    recipe_function,
+    named_recipe,
     resolved,
 )
-from proposer_rl.settings import ArgumentError, plain
+from proposer_rl.settings import ArgumentError, plain, shown
 from proposer_rl.teaching.identity import of_classes
 
 
@@ -32,10 +32,14 @@ def make_curriculum(
     Returns:
         The curriculum; its name or class and all settings that were said of it, for JSON.
     """
+    if not hasattr(space, "space"):
+        raise ArgumentError(
+            f"space={shown(space)}: must be Parameters, Items, LevelGenerator, MadeLevels or a task"
+        )
     run = Components(space, ProposerSettings(), seeds)
     asked: dict[str, Any] = {}
     if isinstance(curriculum, str):
-        curriculum = recipe_function("method", curriculum)()
+        curriculum = named_recipe("curriculum", "method", curriculum)
     if isinstance(curriculum, Recipe):
         named, asked = curriculum.name, recipe_settings(curriculum)
         own = resolved(asked.pop("curriculum"))
@@ -43,8 +47,13 @@ def make_curriculum(
             made: Curriculum = make(resolve_name(own.pop("_target_")), own, run)
         except UnfitTaskError as error:
             raise ArgumentError(f"curriculum={named}: {error}; give a task in its place") from error
-    else:
+    elif isinstance(curriculum, Curriculum):
         made, named, own = curriculum, of_classes(curriculum), {}
+    else:
+        raise ArgumentError(
+            f"curriculum={shown(curriculum)}: must be prl.curricula.NAME(...), its name, or a "
+            "Curriculum of one's own"
+        )
     if isinstance(made, LearnedCurriculum) and made.trains_replicas:
         raise ArgumentError(
             f"curriculum={type(made).__name__}: trains replicas of the learner; use "
