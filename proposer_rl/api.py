@@ -37,7 +37,7 @@ from proposer_rl.models import (
     ProposerNetwork,
     UNet,
 )
-from proposer_rl.recipes import DEFAULT_METHOD, Recipe, filter_content, named_recipe, override
+from proposer_rl.recipes import DEFAULT_METHOD, Recipe, as_recipe, filter_content, override
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
@@ -219,10 +219,8 @@ def train(
     """
     from proposer_rl.cli.compose import compose_and_run
 
-    if isinstance(task, str):
-        task = named_recipe("task", "task", task)
-    if isinstance(curriculum, str):
-        curriculum = named_recipe("curriculum", "method", curriculum)
+    task = as_recipe("task", "task", task)
+    curriculum = as_recipe("curriculum", "method", curriculum)
     overrides = [*task.overrides(), *curriculum.overrides()]
     if scale is not None:
         overrides.append(f"+scale={scale}")

@@ -12,9 +12,9 @@ from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components, UnfitTaskError, around, make, recipe_settings
 from proposer_rl.recipes import (
     Recipe,
+    as_recipe,
     filter_content,
     merged,
-    named_recipe,
     resolved,
 )
 from proposer_rl.settings import ArgumentError, plain, shown
@@ -38,22 +38,16 @@ def make_curriculum(
         )
     run = Components(space, ProposerSettings(), seeds)
     asked: dict[str, Any] = {}
-    if isinstance(curriculum, str):
-        curriculum = named_recipe("curriculum", "method", curriculum)
-    if isinstance(curriculum, Recipe):
-        named, asked = curriculum.name, recipe_settings(curriculum)
-        own = resolved(asked.pop("curriculum"))
-        try:
-            made: Curriculum = make(resolve_name(own.pop("_target_")), own, run)
-        except UnfitTaskError as error:
-            raise ArgumentError(f"curriculum={named}: {error}; give a task in its place") from error
-    elif isinstance(curriculum, Curriculum):
+    if isinstance(curriculum, Curriculum):
         made, named, own = curriculum, of_classes(curriculum), {}
     else:
-        raise ArgumentError(
-            f"curriculum={shown(curriculum)}: must be prl.curricula.NAME(...), its name, or a "
-            "Curriculum of one's own"
-        )
+        recipe = as_recipe("curriculum", "method", curriculum)
+        named, asked = recipe.name, recipe_settings(recipe)
+        own = resolved(asked.pop("curriculum"))
+        try:
+            made = make(resolve_name(own.pop("_target_")), own, run)
+        except UnfitTaskError as error:
+            raise ArgumentError(f"curriculum={named}: {error}; give a task in its place") from error
     if isinstance(made, LearnedCurriculum) and made.trains_replicas:
         raise ArgumentError(
             f"curriculum={type(made).__name__}: trains replicas of the learner; use "

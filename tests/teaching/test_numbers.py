@@ -316,7 +316,7 @@ NO_TEACHER: list[tuple[Any, dict[str, Any], str]] = [
     ({"s": (0.0, 1.0)}, {}, "space={'s': .*: must be Parameters, Items"),
 ]
 NO_CURRICULUM: list[tuple[Any, dict[str, Any], str]] = [
-    ("prl", {"space": LINE}, r"curriculum='prl': must be one of \["),
+    ("prl", {"space": LINE}, "curriculum='prl': must be .* one of accel"),
     (prl.curricula.plr, {"space": LINE}, "curriculum=<function plr .*: must be prl.curricula.NAME"),
 ]
 PAIRS = prl.LevelGenerator(lambda n, g: torch.ones(n, 2), target=lambda n, g: torch.ones(n, 3))
