@@ -436,9 +436,7 @@ class LevelGenerator(LevelSpace):
     ) -> None:
         self._features = features
         drawn = _distributions(target, named)
-        for name, given in {"draw": draw, **drawn, "edit": edit, "features": features}.items():
-            if given is not None and not callable(given):
-                raise ArgumentError(f"{name}={shown(given)}: must be a function")
+        check_functions({"draw": draw, **drawn, "edit": edit or draw, "features": features or draw})
         form: dict[Any, list[int]] = {}
         parts = {name: _Drawn(name, function, form) for name, function in drawn.items()}
         self.distributions = {"all": _Drawn("draw", draw, form), **parts}
@@ -545,7 +543,17 @@ def _item_places(name: str, given: Any, count: int) -> list[int]:
 
 def _distributions(target: T | None, named: Mapping[str, T] | None) -> dict[str, T]:
     """Returns what is said of distributions beside the space itself, by their names."""
+    for name in named or {}:
+        if name == "all" or (name == "target" and target is not None):
+            raise ArgumentError(f"named.{name}: must have another name, which none has yet")
     return {**({} if target is None else {"target": target}), **(named or {})}
+
+
+def check_functions(given: Mapping[str, Any]) -> None:
+    """Refuses what is no function among arguments, by their names."""
+    for name, function in given.items():
+        if not callable(function):
+            raise ArgumentError(f"{name}={shown(function)}: must be a function")
 
 
 def _warn_of_two(key: str, values: Any) -> None:

@@ -196,6 +196,13 @@ def test_features_may_be_a_table_or_an_array(features: Any, expected: Any) -> No
     torch.testing.assert_close(coordinates, torch.tensor(expected, dtype=torch.float32))
 
 
+def test_choices_that_look_alike_are_counted_one_by_one() -> None:
+    teacher = prl.Teacher("plr", prl.Parameters({"on": [True, "True"]}))
+    teacher.ask(40)
+    counts = teacher.log()["drawn"]["on"]
+    assert list(counts) == ["0: True", "1: True"] and sum(counts.values()) == 40
+
+
 def test_pass_rates_may_be_a_tensor_that_numpy_does_not_take() -> None:
     rates = torch.tensor([0.0, 0.5]).bfloat16().requires_grad_()
     assert prl.Items(2, pass_rates=rates).pass_rates.tolist() == [0, 0.5]
@@ -323,6 +330,7 @@ PAIRS = prl.LevelGenerator(lambda n, g: torch.ones(n, 2), target=lambda n, g: to
 NO_GENERATOR: list[tuple[Any, dict[str, Any], str]] = [
     (5, {}, "draw=5: must be a function"),
     (torch.rand, {"target": 5}, "target=5: must be a function"),
+    (torch.rand, {"named": {"all": torch.rand}}, "named.all: must have another name"),
 ]
 NOT_THERE = [
     *((prl.Parameters, *row) for row in NO_PARAMETERS),
@@ -331,6 +339,8 @@ NOT_THERE = [
     *((partial(prl.Teacher, "plr"), *row) for row in NO_TEACHER),
     *((prl.Teacher, *row) for row in NO_CURRICULUM),
     *((prl.LevelGenerator, *row) for row in NO_GENERATOR),
+    (partial(prl.MadeLevels, NINE), 5, {}, "make=5: must be a function"),
+    (partial(prl.MadeLevels, NINE), abs, {"features": 5}, "features=5: must be a function"),
     (prl.Teacher("adaptive_mixture", PAIRS).ask, 9, {}, r"target={'level': \[3\]}: must give .*2"),
 ]
 
