@@ -37,7 +37,7 @@ from proposer_rl.models import (
     ProposerNetwork,
     UNet,
 )
-from proposer_rl.recipes import DEFAULT_METHOD, Recipe, filter_content, override, recipe_function
+from proposer_rl.recipes import DEFAULT_METHOD, Recipe, as_recipe, filter_content, override
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
@@ -219,10 +219,8 @@ def train(
     """
     from proposer_rl.cli.compose import compose_and_run
 
-    if isinstance(task, str):
-        task = recipe_function("task", task)()
-    if isinstance(curriculum, str):
-        curriculum = recipe_function("method", curriculum)()
+    task = as_recipe("task", "task", task)
+    curriculum = as_recipe("curriculum", "method", curriculum)
     overrides = [*task.overrides(), *curriculum.overrides()]
     if scale is not None:
         overrides.append(f"+scale={scale}")

@@ -113,6 +113,25 @@ def available(group: str, folder: Path = CONFIG_FOLDER) -> list[str]:
     return sorted(file.stem for file in (folder / group).glob("*.yaml"))
 
 
+HOW = {
+    "task": "prl.tasks.NAME(...), from_gymnasium(env_id, ...) or one of",
+    "method": "prl.curricula.NAME(...) or one of",
+}
+
+
+def as_recipe(argument: str, group: Literal["task", "method"], given: Any) -> Recipe:
+    """Returns a recipe, also of its name.
+
+    Raises:
+        ArgumentError: naming the argument, if it is neither.
+    """
+    if isinstance(given, Recipe):
+        return given
+    if not isinstance(given, str) or given not in available(group):
+        raise _refusal(f"{argument}={given!r}: must be {HOW[group]} {', '.join(available(group))}")
+    return recipe_function(group, given)()
+
+
 def recipe_function(group: Literal["task", "method"], name: str) -> Callable[..., Recipe]:
     """Returns the function ``prl.curricula.NAME`` or ``prl.tasks.NAME``.
 

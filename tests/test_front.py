@@ -243,7 +243,7 @@ def test_what_cannot_be_imported_again_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("curriculum", "options", "message"),
     [
-        ("plrr", {}, "there is no 'plrr'; there are: accel, adaptive_mixture"),
+        ("plrr", {}, "curriculum='plrr': must be prl.curricula.NAME(...) or one of accel, adap"),
         ("plr", {"scale": "tiny"}, "scale/tiny: unknown; choose one of"),
         ("plr", {"seed": "x"}, "seed='x': input should be a valid integer"),
         ("plr", {"updates": 0}, "schedule.updates=0: input should be greater than or equal to 1"),
@@ -265,6 +265,24 @@ def test_bad_input_is_one_line_and_leaves_nothing(
         prl.train("maze", curriculum, folder=tmp_path / "run", **{**SMOKE, **options})
     assert "\n" not in str(refused.value)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("task", "more", "message"),
+    [
+        ("cartpole", {"updates": 0}, "schedule.updates=0: input should be greater"),  # not PPO's
+        (
+            "CartPole-v1",
+            {},
+            "task='CartPole-v1': must be .* from_gymnasium",
+        ),
+        (prl.tasks.maze, {}, "task=<function .*: must be prl.tasks.NAME"),
+        ("cartpole", {"curriculum": 3}, "curriculum=3: must be prl.curricula.NAME"),
+    ],
+)
+def test_what_is_no_run_names_what_was_given(task: Any, more: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=f"^{message}"):
+        prl.train(task, **more)
 
 
 def test_settings_of_recipes_are_checked_where_they_are_given() -> None:

@@ -146,11 +146,11 @@ class RunConfig:
     seed: Annotated[int, Ge(0)]
     seeds: Annotated[list[Annotated[int, Ge(0)]], Len(1)]
     precision: Literal["auto", "fp32", "bf16"]
+    schedule: ScheduleSettings  # others refer to it
     hand_designed: HandDesignedSettings
     pool: PoolSettings
     solver: SolverSettings
     proposer: ProposerSettings
-    schedule: ScheduleSettings
     compute: ComputeSettings
     logger: LoggerSettings
 

@@ -29,6 +29,7 @@ from proposer_rl.meta.first_order import (
     over_steps,
     surrogate,
 )
+from proposer_rl.settings import ArgumentError
 from proposer_rl.task import (
     DifferentiableTask,
     Levels,
@@ -133,7 +134,7 @@ class Student:
         self.frames, self.evaluations = 0, 0
         for name, function in can.items():
             if name not in ABILITIES:
-                raise ValueError(f"{name}: a student can have {', '.join(ABILITIES)}")
+                raise ArgumentError(f"{name}: unknown; there are: {', '.join(ABILITIES)}")
             setattr(self, name, function)
 
     def spend(self, *, frames: int = 0, evaluations: int = 0) -> None:

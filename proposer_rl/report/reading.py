@@ -76,7 +76,9 @@ def begun(folder: Path) -> list[Path]:
 def _walk(folder: Path) -> Iterator[tuple[Path, set[str]]]:
     """Yields folders of runs and studies with their files' names; skips links and hidden ones."""
     if not folder.is_dir():
-        raise UnreadableRun(f"{folder}: there is no such folder")
+        is_file = "is no folder of runs; bin/report takes logs of teachers, *.jsonl, by themselves"
+        what = is_file if folder.exists() else "there is no such folder"
+        raise UnreadableRun(f"{folder}: {what}")
     for seen, (root, names, files) in enumerate(os.walk(folder)):
         if seen > MOST_FOLDERS:
             raise UnreadableRun(f"{folder}: more than {MOST_FOLDERS} folders in it; name them")

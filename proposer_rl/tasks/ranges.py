@@ -117,10 +117,13 @@ def choice_bins(values: list[Any]) -> Bins:
     """Returns a bin for each of some rising numbers, or of whatever else there is to choose from.
 
     Raises:
-        ValueError: for numbers that do not rise, or are too large.
+        ValueError: for numbers that do not rise, or are too large; for a text that comes twice.
     """
     if all(map(is_real, values)):
         return points(values)
+    texts = [value for value in values if isinstance(value, str)]
+    if len({*texts}) < len(texts):
+        raise ValueError("must have each text once")
     places = torch.arange(len(values))
     return Labelled(places, places, values)
 
@@ -183,7 +186,9 @@ def read_part(key: str, given: Any, line: Bins) -> Bins:
             raise ArgumentError(f"{key}.{error}") from error
     if isinstance(line, Labelled):
         chosen = given if isinstance(given, list) else [given]
-        if any(value not in line.labels or chosen.count(value) > 1 for value in chosen):
+        if not chosen or any(
+            value not in line.labels or chosen.count(value) > 1 for value in chosen
+        ):
             raise ArgumentError(f"{key}={given!r}: must be among {line.labels}, each once")
         return points(sorted(map(line.labels.index, chosen)))
     many = [given] if is_real(given) else given
@@ -281,7 +286,7 @@ def spaces(
             bins[name], target[name] = given.space_bins(), given.target_bins()
         except ValueError as error:
             raise ValueError(f"parameters.{name}: {error}") from error
-        if _inside(target[name], bins[name]) < 0.5:  # a typing error, or extrapolation
+        if inside(target[name], bins[name]) < 0.5:  # a typing error, or extrapolation
             warnings.warn(
                 f"parameters.{name}: most of the target, {target[name]}, lies outside of "
                 f"low={given.low:g} to high={given.high:g}, which training levels come from",
@@ -290,7 +295,7 @@ def spaces(
     return ParameterSpace(bins, **seeds), ParameterSpace(target, **seeds)
 
 
-def _inside(target: Bins, space: Bins) -> float:
+def inside(target: Bins, space: Bins) -> float:
     """Returns how much of a target lies within the ends of a space."""
     low, high = space.low[:1].double(), space.high[-1:].double()
     below = torch.nextafter(low, low - 1)

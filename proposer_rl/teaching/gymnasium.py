@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from torch import Tensor
 
-from proposer_rl.settings import ArgumentError
+from proposer_rl.settings import ArgumentError, shown
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, as_number, entries, stepped
 from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write_attribute
 from proposer_rl.tasks.parameters import SEED
@@ -62,8 +62,10 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         if teacher.students != 1 or "rollout" in teacher.reads:
             raise ArgumentError("teacher: must be of one student, and of a curriculum that is told")
-        if isinstance(set, str) and set != "options":
+        if not (isinstance(set, Mapping) or callable(set) or set == "options"):
             raise ArgumentError(f"set={set!r}: must be attributes, a function or 'options'")
+        if not (success is None or isinstance(success, str) or callable(success)):
+            raise ArgumentError(f"success={success!r}: must be an entry, a function or None")
         self._teacher, self._how, self._rule = teacher, set, success
         self._once, self._reset_truncates = once, reset_truncates
         self._ticket: int | None = None
@@ -81,6 +83,11 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         if callable(self._how):
             self._how(self.env.unwrapped, self._level)
         elif isinstance(self._how, str):
+            if not isinstance(self._level, Mapping):
+                raise ArgumentError(
+                    f"set='options': must be a function, as this level has no names: "
+                    f"{shown(self._level)}"
+                )
             options = {**(options or {}), **self._level}
         else:
             self._set(self._how)
@@ -119,11 +126,12 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _end(self) -> None:
         """Reports the episode to the teacher."""
         self._note(self._success())
-        needed = isinstance(self._rule, str) or "success" in self._teacher.reads
+        needed = self._rule is not None or "success" in self._teacher.reads
         if self._succeeded is None and needed:
             own = {name: self._last[name] for name in self._last.keys() - {"level", "level_id"}}
+            known = "gives None of the last info", "the last info has no such entry"
             raise ArgumentError(
-                f"success={self._rule!r}: the last info has no such entry; give one that it has, "
+                f"success={self._rule!r}: {known[not callable(self._rule)]}; give one that it has, "
                 f"{', '.join(sorted(name for name, _ in entries(own)))}, or a function"
             )
         self._teacher.tell(self._ticket, self._return, self._succeeded, steps=self._steps)

@@ -12,12 +12,12 @@ from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components, UnfitTaskError, around, make, recipe_settings
 from proposer_rl.recipes import (
     Recipe,
+    as_recipe,
     filter_content,
     merged,
-    recipe_function,
     resolved,
 )
-from proposer_rl.settings import ArgumentError, plain
+from proposer_rl.settings import ArgumentError, plain, shown
 from proposer_rl.teaching.identity import of_classes
 
 
@@ -32,19 +32,22 @@ def make_curriculum(
     Returns:
         The curriculum; its name or class and all settings that were said of it, for JSON.
     """
+    if not hasattr(space, "space"):
+        raise ArgumentError(
+            f"space={shown(space)}: must be Parameters, Items, LevelGenerator, MadeLevels or a task"
+        )
     run = Components(space, ProposerSettings(), seeds)
     asked: dict[str, Any] = {}
-    if isinstance(curriculum, str):
-        curriculum = recipe_function("method", curriculum)()
-    if isinstance(curriculum, Recipe):
-        named, asked = curriculum.name, recipe_settings(curriculum)
+    if isinstance(curriculum, Curriculum):
+        made, named, own = curriculum, of_classes(curriculum), {}
+    else:
+        recipe = as_recipe("curriculum", "method", curriculum)
+        named, asked = recipe.name, recipe_settings(recipe)
         own = resolved(asked.pop("curriculum"))
         try:
-            made: Curriculum = make(resolve_name(own.pop("_target_")), own, run)
+            made = make(resolve_name(own.pop("_target_")), own, run)
         except UnfitTaskError as error:
             raise ArgumentError(f"curriculum={named}: {error}; give a task in its place") from error
-    else:
-        made, named, own = curriculum, of_classes(curriculum), {}
     if isinstance(made, LearnedCurriculum) and made.trains_replicas:
         raise ArgumentError(
             f"curriculum={type(made).__name__}: trains replicas of the learner; use "

@@ -40,6 +40,37 @@ def as_outcome(results: Mapping[str, NDArray[np.float64]]) -> TensorDict:
     return TensorDict(outcome, outcome["return"].shape)
 
 
+def by_name(outcome: Any) -> dict[str, Any]:
+    """Returns the results of an outcome, or its rollout alone where it has one.
+
+    Raises:
+        ArgumentError: if it has no names, no return, or a name that means nothing here.
+    """
+    if not hasattr(outcome, "keys"):
+        raise ArgumentError(f"outcome={shown(outcome)}: must have results by name, as return")
+    names = [*outcome.keys()]
+    if "rollout" in names:
+        return {"rollout": outcome["rollout"]}
+    if "return" not in names:
+        raise ArgumentError(f"outcome={sorted(names)}: has no return")
+    if unknown := [name for name in names if name not in RESULTS]:
+        raise ArgumentError(f"outcome.{unknown[0]}: unknown; there are: {', '.join(RESULTS)}")
+    return {name: outcome[name] for name in names}
+
+
+def as_device(device: Any) -> torch.device:
+    """Returns a device of this machine.
+
+    Raises:
+        ArgumentError: if there is no such device.
+    """
+    try:
+        return torch.empty(0, device=torch.device(device)).device
+    except (RuntimeError, AssertionError, TypeError) as error:
+        line = str(error).partition("\n")[0]
+        raise ArgumentError(f"device={device}: must be one that torch has here: {line}") from error
+
+
 def as_array(
     name: str, value: Any, shape: tuple[int, ...], for_all: bool = False
 ) -> NDArray[np.float64]:

@@ -20,16 +20,24 @@ from proposer_rl.models import callers_state, own_state
 from proposer_rl.settings import ArgumentError, plain, shown, whole
 from proposer_rl.task import Distribution, Levels, space_features
 from proposer_rl.tasks.parameters import SEED, Bins, Law, ParameterSpace
-from proposer_rl.tasks.ranges import python_values, read_line, read_part, target_in_file
+from proposer_rl.tasks.ranges import (
+    inside,
+    python_values,
+    read_line,
+    read_part,
+    target_in_file,
+)
 from proposer_rl.teaching.tables import (
     expected_log_odds,
     few_columns,
+    float_array,
     item_table,
     number_table,
     rate_columns,
 )
 
 DRAWN = "level"  # the entry that holds a generator's tensors
+FAR = 10.0  # of a feature, from 0
 Ranges = Mapping[str, Any]
 T = TypeVar("T")
 
@@ -47,6 +55,7 @@ class LevelSpace:
     distributions: Mapping[str, Distribution]
     _features: Features | None = None
     _width: int | None = None  # of a row of features, once there was one
+    _far = False  # whether one was far from 0
 
     @property
     def space(self) -> LevelSpace:
@@ -90,8 +99,16 @@ class LevelSpace:
             raise ArgumentError(
                 f"features={list(known.shape)}: must give rows of one length, first {self._width}"
             )
-        if not known.isfinite().all():
-            raise ArgumentError(f"features={shown(known.tolist())}: must give finite numbers")
+        if not known.float().isfinite().all():
+            raise ArgumentError(f"features={shown(known.tolist())}: must give finite float32")
+        most = float(known.abs().max()) if known.numel() else 0.0
+        if most > FAR and not self._far:
+            self._far = True
+            warnings.warn(
+                f"features={most:g}: each should be about -1 to 1; of others a model of outcomes "
+                "can learn little, and the largest decide which levels are near",
+                stacklevel=2,
+            )
         return known.reshape(*shape, known.shape[1])
 
     def given(self, levels: Levels) -> Any:
@@ -150,6 +167,9 @@ class Parameters(LevelSpace, ParameterSpace):
         _check_names("ranges", ranges, ranges)
         if not ranges:
             raise ArgumentError("ranges={}: must have at least one parameter")
+        for name in ranges:
+            if not isinstance(name, str):
+                raise ArgumentError(f"ranges.{name}: must have a text as its name")
         if seeded and SEED in ranges:
             raise ArgumentError("ranges.seed, seeded=True: a level has one seed; leave out either")
         counts = dict.fromkeys(ranges, 8)
@@ -243,6 +263,12 @@ class Parameters(LevelSpace, ParameterSpace):
                 raise ArgumentError(
                     f"{where}={shown(plain(given))}: must lie within {low:g} to {high:g}"
                 )
+            if isinstance(part, Law) and inside(part, line) < 0.5:
+                warnings.warn(
+                    f"{where}: most of it, {part}, lies outside of {low:g} to {high:g}, and comes "
+                    "from the nearer end",
+                    stacklevel=5,
+                )
         return parts
 
 
@@ -292,10 +318,14 @@ class Items(LevelSpace):
         lines, self.categories = item_table(
             torch.arange(count).unsqueeze(-1) if features is None else features
         )
-        if lines.ndim != 2 or len(lines) != count or not lines.float().isfinite().all():
+        if lines.ndim != 2 or len(lines) != count:
             raise ArgumentError(
-                f"features={list(lines.shape)}: must have a row of finite numbers for each item"
+                f"features={list(lines.shape)}: must be [{count}, D], a row for each item"
             )
+        if len(wrong := (~lines.float().isfinite()).nonzero()):
+            number = lines[tuple(wrong[0])]
+            what = f"must be finite in float32, as of item {int(wrong[0, 0])}"
+            raise ArgumentError(f"features={number:g}: {what}")
         self.pass_rates = None if pass_rates is None else _rates(pass_rates, count)
         self.expected = None if self.pass_rates is None else expected_log_odds(self.pass_rates)
         rates = torch.zeros(count, 0)
@@ -391,7 +421,8 @@ class LevelGenerator(LevelSpace):
         named: further functions like ``draw``, by name, for hand-designed curricula.
 
     Raises:
-        ArgumentError: if levels are no such thing, or not as many as are asked for.
+        ArgumentError: if levels are no such thing, not as many as are asked for, or of other
+            entries and shapes than those before.
     """
 
     def __init__(
@@ -405,8 +436,10 @@ class LevelGenerator(LevelSpace):
     ) -> None:
         self._features = features
         drawn = _distributions(target, named)
-        parts = {name: _Drawn(name, function) for name, function in drawn.items()}
-        self.distributions = {"all": _Drawn("draw", draw), **parts}
+        check_functions({"draw": draw, **drawn, "edit": edit or draw, "features": features or draw})
+        form: dict[Any, list[int]] = {}
+        parts = {name: _Drawn(name, function, form) for name, function in drawn.items()}
+        self.distributions = {"all": _Drawn("draw", draw, form), **parts}
         if edit is not None:
             self.edit = self._edits(edit)
 
@@ -447,13 +480,25 @@ class LevelGenerator(LevelSpace):
 
 
 class _Drawn:
-    def __init__(self, name: str, draw: Callable[[int, torch.Generator], Any]) -> None:
-        self._name, self._draw = name, draw
+    """Draws levels by a function, all of one form: the shapes of a level's entries, by name."""
+
+    def __init__(
+        self,
+        name: str,
+        draw: Callable[[int, torch.Generator], Any],
+        form: dict[Any, list[int]],
+    ) -> None:
+        self._name, self._draw, self._form = name, draw, form
 
     def sample(self, count: int, generator: torch.Generator) -> Levels:
         with callers_state():
             levels = self._draw(count, generator)
-        return _taken(self._name, levels, count)
+        taken = _taken(self._name, levels, count)
+        form = {name: [*entry.shape[1:]] for name, entry in taken.items(True, True)}
+        if form != (self._form or form):
+            raise ArgumentError(f"{self._name}={form}: must give levels of one form, {self._form}")
+        self._form.update(form)
+        return taken
 
 
 def _taken(name: str, levels: Any, count: int) -> Levels:
@@ -473,7 +518,7 @@ def _taken(name: str, levels: Any, count: int) -> Levels:
 def _rates(given: Any, count: int) -> Tensor:
     """Returns pass rates, float64 [N]."""
     try:
-        rates = torch.as_tensor(np.array(given, dtype=np.float64))
+        rates = torch.from_numpy(float_array(given))
     except (TypeError, ValueError, RuntimeError) as error:
         raise ArgumentError(f"pass_rates={shown(given)}: must be numbers [N]") from error
     if rates.shape != (count,):
@@ -498,7 +543,17 @@ def _item_places(name: str, given: Any, count: int) -> list[int]:
 
 def _distributions(target: T | None, named: Mapping[str, T] | None) -> dict[str, T]:
     """Returns what is said of distributions beside the space itself, by their names."""
+    for name in named or {}:
+        if name == "all" or (name == "target" and target is not None):
+            raise ArgumentError(f"named.{name}: must have another name, which none has yet")
     return {**({} if target is None else {"target": target}), **(named or {})}
+
+
+def check_functions(given: Mapping[str, Any]) -> None:
+    """Refuses what is no function among arguments, by their names."""
+    for name, function in given.items():
+        if not callable(function):
+            raise ArgumentError(f"{name}={shown(function)}: must be a function")
 
 
 def _warn_of_two(key: str, values: Any) -> None:

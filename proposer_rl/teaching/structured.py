@@ -11,7 +11,14 @@ from torch import Tensor
 
 from proposer_rl.settings import ArgumentError
 from proposer_rl.tasks.parameters import ParameterSpace
-from proposer_rl.teaching.spaces import DRAWN, Features, LevelSpace, Parameters, Ranges
+from proposer_rl.teaching.spaces import (
+    DRAWN,
+    Features,
+    LevelSpace,
+    Parameters,
+    Ranges,
+    check_functions,
+)
 
 Make = Callable[[TensorDictBase, torch.Generator], Any]
 
@@ -52,6 +59,7 @@ class MadeLevels(Parameters):
         target: Ranges | None = None,
         named: Mapping[str, Ranges] | None = None,
     ) -> None:
+        check_functions({"make": make, "features": features or make})
         super().__init__(ranges, bins=bins, target=target, named=named)
         self._make, self._features = make, features
         parts = {name: _Made(part, self) for name, part in self._parts.items()}

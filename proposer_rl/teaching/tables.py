@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from proposer_rl.curricula.belief import WIDEST
@@ -45,7 +48,7 @@ def number_table(features: Any) -> Tensor:
 def item_table(features: Any) -> Table:
     """Returns what a table, columns by name, or rows say of items.
 
-    A column whose first entry is a text is a category.
+    A column whose first entry that is not missing is a text is a category.
 
     Raises:
         ArgumentError: naming the column that has neither numbers nor few texts.
@@ -53,7 +56,10 @@ def item_table(features: Any) -> Table:
     columns = _columns(features)
     texts = [_begins_with_text(column) for column in columns.values()]
     if not columns or (not any(texts) and hasattr(features, "__array__")):
-        return Table(number_table(features), None)
+        return Table(number_table(features).cpu(), None)
+    for name, column in columns.items():
+        if not hasattr(column, "__len__"):
+            raise ArgumentError(f"features.{name}={shown(column)}: must be a column, [N]")
     if len({len(column) for column in columns.values()}) > 1:
         raise ArgumentError(f"features={[*columns]}: must have columns of one length")
     parts, codes = [], []
@@ -75,7 +81,8 @@ def item_table(features: Any) -> Table:
 
 def _columns(features: Any) -> dict[str, Any]:
     """Returns columns by name, of rows with texts by place; nothing where all are numbers."""
-    if hasattr(features, "items"):
+    is_series = getattr(features, "ndim", 2) == 1 and not isinstance(features, Mapping)
+    if hasattr(features, "items") and not is_series:
         return {str(name): column for name, column in features.items()}
     if isinstance(features, Tensor) or not _begins_with_text(features):
         return {}
@@ -87,16 +94,29 @@ def _columns(features: Any) -> dict[str, Any]:
 
 
 def _begins_with_text(cells: Any) -> bool:
-    """Returns whether the first of some cells, or one in the first row, is a text."""
-    first = next(iter(cells), None) if hasattr(cells, "__iter__") else None
+    """Returns whether the first of some cells that is there, or one in the first row, is a text."""
+    there = (cell for cell in cells if not _is_missing(cell)) if hasattr(cells, "__iter__") else ()
+    first = next(iter(there), None)
     inner = first if isinstance(first, list | tuple | np.ndarray) else [first]
     return any(isinstance(cell, str) for cell in inner)
+
+
+def _is_missing(cell: Any) -> bool:
+    return cell is None or (isinstance(cell, float) and math.isnan(cell))
+
+
+def float_array(numbers: Any) -> NDArray[np.float64]:
+    """Returns a copy of numbers, also of tensors with a gradient, on a GPU or of bfloat16."""
+    if isinstance(numbers, Tensor):
+        numbers = numbers.detach().cpu().double()
+        return numbers.numpy().copy()
+    return np.array(numbers, dtype=np.float64)
 
 
 def _numbers(name: str, column: Any) -> Tensor:
     cells = column if hasattr(column, "__array__") else [*column]
     try:
-        return torch.from_numpy(np.array(cells, dtype=np.float64)).reshape(len(cells), -1)
+        return torch.from_numpy(float_array(cells)).reshape(len(cells), -1)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ArgumentError(f"{name}={shown(column)}: must be numbers or texts") from error
 

@@ -106,7 +106,7 @@ def _bin_texts(space: Any) -> dict[str, list[str]]:
     if isinstance(space, ParameterSpace):
         labels = getattr(space, "labels", {})
         return {
-            name: _distinct(part) if labels.get(name) is None else [*map(str, labels[name])]
+            name: _distinct(part) if labels.get(name) is None else _label_texts(labels[name])
             for name, part in space.bins.items()
         }
     if isinstance(space, Items):
@@ -129,6 +129,13 @@ def _distinct(part: Bins) -> list[str]:
         if len({*texts}) == len(texts):
             break
     return texts
+
+
+def _label_texts(labels: list[Any]) -> list[str]:
+    """Returns names of choices, with their places where two look alike."""
+    texts = [*map(str, labels)]
+    alike = len({*texts}) < len(texts)
+    return [f"{place}: {text}" for place, text in enumerate(texts)] if alike else texts
 
 
 def _parts(space: Items) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +24,7 @@ from proposer_rl.curricula.ledger import OUT, OVER, RETURNED, Block, Ledger
 from proposer_rl.models import own_state
 from proposer_rl.recipes import Recipe
 from proposer_rl.runs.folder import storage
-from proposer_rl.settings import ArgumentError, Count, checked, whole
+from proposer_rl.settings import ArgumentError, Count, checked, shown, whole
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels, Task
 from proposer_rl.teaching.abilities import adapted
@@ -36,9 +37,11 @@ from proposer_rl.teaching.results import (
     RESULTS,
     argument,
     as_array,
+    as_device,
     as_ids,
     as_number,
     as_outcome,
+    by_name,
     ended,
     outcome_of_rollout,
 )
@@ -117,7 +120,7 @@ class Teacher:
         student: Student | None = None,
         **can: Any,
     ) -> None:
-        self.space, self.device, self.block = space, torch.device(device), block
+        self.space, self.device, self.block = space, as_device(device), block
         self._seeds = [whole("seed", seed) + number for number in range(students)]
         self.curriculum, self._made_of = make_curriculum(curriculum, space, filter, self._seeds)
         self._alone = students == 1
@@ -134,6 +137,7 @@ class Teacher:
         self._success = success
         self._ledger, self._tally = Ledger(dict.fromkeys(RESULTS, float)), Tally(space)
         self._scored: bool | None = None  # whether results come with a score; None before any
+        self._succeeded: set[bool] = set()  # whether they came with a success, or without
         self._proposals = 0
         self._whole: list[int] = []  # first tickets of what propose() has given
         self._block, self._counted = None, 0
@@ -207,7 +211,8 @@ class Teacher:
             ids: a ticket, or tickets [n] in any order.
             return_: undiscounted, of an episode on each level or a mean of several: a number, or
                 numbers [n] ([K, n] of several students; [K] for one ticket).
-            success: whether, or of how many of them; from 0 to 1.
+            success: whether, or of how many of them; from 0 to 1. It counts where all levels that
+                are observed together have one.
             score: how much there is to learn on the level, where the loop says so itself, such as
                 the mean of its absolute advantages; for curricula that score levels. For all
                 levels of the teacher or for none.
@@ -219,7 +224,8 @@ class Teacher:
                 or not finite, another shape.
         """
         given = (return_, success, score, episodes, steps)
-        results = {name: one for name, one in zip(RESULTS, given) if one is not None}  # noqa: B905
+        pairs = zip(RESULTS, given, strict=True)
+        results = {n: one for n, one in pairs if one is not None or n == "return"}
         with self._here():
             if "rollout" in self.reads:
                 raise ArgumentError("tell: this curriculum reads rollouts; use observe(rollout)")
@@ -229,10 +235,10 @@ class Teacher:
                 numbers = {name: as_number(name, value) for name, value in results.items()}
                 self._check_score(results)
                 self._ledger.tell_one(ids, numbers)
-                self._scored = "score" in results
                 self._tally.returned(1, numbers["return"], numbers.get("success"))
             else:
                 self._tell(as_ids(ids), results)
+            self._note_known(results)
 
     def predicted(self, ids: Any) -> NDArray[np.float64] | None:
         """Returns the success that the curriculum expected of levels when it proposed them.
@@ -306,16 +312,15 @@ class Teacher:
                 self._kept = left
                 return
             tickets = self._proposed() if ids is None else as_ids(ids)
-            if "rollout" in outcome.keys():
-                self._observe_rollout(tickets, outcome["rollout"])
+            results = by_name(outcome)
+            if "rollout" in results:
+                self._observe_rollout(tickets, results["rollout"])
             else:
                 if "rollout" in self.reads:
                     raise ArgumentError("outcome: has no rollout, which this curriculum reads")
-                self._require_success("success" in outcome.keys(), "put it into the outcome")
-                results = {name: outcome[name] for name in RESULTS if name in outcome.keys()}
-                if "return" not in results:
-                    raise ArgumentError(f"outcome={sorted(outcome.keys())}: has no return")
+                self._require_success("success" in results, "put it into the outcome")
                 self._tell(tickets, results)
+                self._note_known(results)
             if ids is None:
                 self._whole.clear()
 
@@ -369,11 +374,13 @@ class Teacher:
         """Puts back what :meth:`state_dict` returned, on whichever device its tensors are.
 
         Raises:
-            ArgumentError: if it is of another space, curriculum, setting of it or number of
+            ArgumentError: if it is none, of another space, curriculum, setting of it or number of
                 students, naming what differs, or tickets are out, as of environments that have
                 begun; then nothing has changed.
         """
         with self._here():
+            if not isinstance(state, Mapping) or not {"of", "ledger"} <= state.keys():
+                raise ArgumentError(f"state={shown(state)}: must be of Teacher.state_dict()")
             state = tree_map_only(Tensor, Tensor.cpu, state)
             if state["students"] != self.students:
                 raise ArgumentError(f"state: of {state['students']} students, not {self.students}")
@@ -486,7 +493,6 @@ class Teacher:
         }
         self._check_score(results)
         self._ledger.tell(self._ledger.find(ids), arrays)
-        self._scored = "score" in results
         self._tally.returned(len(ids), arrays["return"], arrays.get("success"))
 
     def _observe_rollout(self, ids: NDArray[np.int64], rollout: TensorDictBase) -> None:
@@ -517,6 +523,19 @@ class Teacher:
         if self._scored not in (None, "score" in results):
             how = "missing: other levels were told with one" if self._scored else "others had none"
             raise ArgumentError(f"score: {how}; give it for all or for none")
+
+    def _note_known(self, results: Mapping[str, Any]) -> None:
+        """Notes what came beside returns, and warns, once, of success for some levels alone."""
+        self._scored, known = "score" in results, "success" in results
+        if known not in self._succeeded:
+            self._succeeded.add(known)
+            if len(self._succeeded) == 2:
+                warnings.warn(
+                    "success: told of some levels alone; curricula read it only where all levels "
+                    "that they observe together have one, and mean_success is of those that have; "
+                    "tell it of failures, too",
+                    stacklevel=3,
+                )
 
     def _require_success(self, known: bool, how: str) -> None:
         if "success" in self.reads and not known:

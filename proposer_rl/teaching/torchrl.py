@@ -18,7 +18,7 @@ from torchrl.envs import (
     VecGymEnvTransform,
 )
 
-from proposer_rl.settings import ArgumentError
+from proposer_rl.settings import ArgumentError, shown
 from proposer_rl.teaching.remote import TeacherClient
 from proposer_rl.teaching.results import LEVEL_ID
 from proposer_rl.teaching.teacher import Success, Teacher
@@ -82,6 +82,14 @@ class LevelTransform(Transform):
         super().__init__(in_keys=[], out_keys=[LEVEL_ID])
         if teacher.students != 1:
             raise ArgumentError(f"teacher: of {teacher.students} students, but must be of one")
+        if not callable(set_level):
+            raise ArgumentError(
+                f"set_level={shown(set_level)}: must be a function of env and levels"
+            )
+        if not (success is None or isinstance(success, str | tuple) or callable(success)):
+            raise ArgumentError(
+                f"success={success!r}: must be an entry of next, a function or None"
+            )
         if tell and "rollout" in teacher.reads:
             raise ArgumentError(
                 "tell=True: this curriculum reads rollouts; give tell=False, and each rollout to "

@@ -206,6 +206,20 @@ def test_success_is_what_the_rule_says(rule: str) -> None:
     }
 
 
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"set": None}, "set=None: must be attributes, a function or 'options'"),
+        ({"set": ["gravity"]}, r"set=\['gravity'\]: must be attributes, a function"),
+        ({"set": "options"}, "set='options': must be a function, as this level has no names: 0"),
+        ({"set": set_level, "success": True}, "success=True: must be an entry, a function or None"),
+    ],
+)
+def test_what_a_wrapper_must_not_get(more: dict[str, Any], message: str) -> None:
+    with pytest.raises(ArgumentError, match=f"^{message}"):
+        prl.TaughtEnv(LevelEnv(), prl.Teacher("plr", prl.Items(1)), **more).reset()
+
+
 def answering(**members: Any) -> gymnasium.Env[Any, Any]:
     return type("Odd", (LevelEnv,), members)()
 
@@ -233,6 +247,7 @@ def test_one_number_in_an_array_is_a_reward(reward: Any) -> None:
         (answering(step=lambda self, a: (0, 1.0, True, {})), {}, "env: step must return five"),
         (paying(1.0), {"success": "won"}, "success='won': .* it has, terminated, truncated, or"),
         (paying(1.0), {"success": lambda last: "yes"}, "success=.*must be a number, not 'yes'"),
+        (paying(1.0), {"success": lambda last: None}, "success=.*: gives None of the last info;"),
     ],
 )
 def test_what_a_step_must_not_answer(env: Any, more: Any, message: str) -> None:

@@ -182,6 +182,9 @@ FEATURES = [
     (np.broadcast_to([3.0, 1.0], (3, 2))[:, ::-1], [[-1, -1]] * 3),
     ([[0.0], [0.5], [1.0]], [[-1], [0], [1]]),
     (OmegaConf.create([[0.0], [0.5], [1.0]]), [[-1], [0], [1]]),
+    (pd.Series(["red", "blue", "red"]), [[-1, 1], [1, -1], [-1, 1]]),
+    ({"a": [None, "red", "red"]}, [[1, -1], [-1, 1], [-1, 1]]),  # what is missing is a category
+    ({"a": torch.tensor([0.0, 0.5, 1.0]).bfloat16().requires_grad_()}, [[-1], [0], [1]]),
 ]
 
 
@@ -191,6 +194,49 @@ def test_features_may_be_a_table_or_an_array(features: Any, expected: Any) -> No
         warnings.simplefilter("error")
         coordinates = prl.Items(3, features=features).coordinates
     torch.testing.assert_close(coordinates, torch.tensor(expected, dtype=torch.float32))
+
+
+def test_choices_that_look_alike_are_counted_one_by_one() -> None:
+    teacher = prl.Teacher("plr", prl.Parameters({"on": [True, "True"]}))
+    teacher.ask(40)
+    counts = teacher.log()["drawn"]["on"]
+    assert list(counts) == ["0: True", "1: True"] and sum(counts.values()) == 40
+
+
+def test_pass_rates_may_be_a_tensor_that_numpy_does_not_take() -> None:
+    rates = torch.tensor([0.0, 0.5]).bfloat16().requires_grad_()
+    assert prl.Items(2, pass_rates=rates).pass_rates.tolist() == [0, 0.5]
+
+
+def far_features() -> None:
+    space = prl.LevelGenerator(
+        lambda n, g: torch.rand(n, 2, generator=g), features=lambda x: 1e6 * x
+    )
+    prl.Teacher("adaptive_mixture", space).ask(400)
+
+
+def far_target() -> None:
+    prl.Parameters({"g": (0.0, 1.0)}, target={"g": {"distribution": "norm", "loc": 5.0}})
+
+
+def some_successes() -> None:
+    teacher = prl.Teacher("adaptive_mixture", LINE)
+    for success in (None, True, None, True):
+        teacher.tell(teacher.ask()[0], 0.0, success)
+
+
+@pytest.mark.parametrize(
+    ("misread", "message"),
+    [
+        (far_features, "features=.*: each should be about -1 to 1"),
+        (far_target, "target.g: most of it, norm.*, lies outside of 0 to 1"),
+        (some_successes, "success: told of some levels alone"),
+    ],
+)
+def test_what_may_be_misread_is_said_once(misread: Callable[[], None], message: str) -> None:
+    with pytest.warns(UserWarning, match=message) as said:
+        misread()
+    assert len(said) == 1
 
 
 def test_an_array_that_a_function_draws_is_a_tensor() -> None:
@@ -213,6 +259,9 @@ def draws(what: Any) -> Any:
 NINE = {"g": range(9)}
 BOTH, LOW = {"low": 0, "high": 1, "values": [1]}, {"low": 0, "high": 9}
 NO_PARAMETERS: list[tuple[Any, dict[str, Any], str]] = [
+    ({3: (0.0, 1.0)}, {}, "ranges.3: must have a text as its name"),
+    ({"g": ["a", "b", "a"]}, {}, "ranges.g=.*: must have each text once"),
+    ({"g": ["a", "b"]}, {"target": {"g": []}}, r"target.g=\[\]: must be among"),
     ({"g": (0.0, HUGE)}, {}, r"ranges.g=\(0.0, 1e\+39\): .* both finite, at"),
     ({"g": (NAN, 1.0)}, {}, r"ranges.g=\(nan, 1.0\): low=nan must be below"),
     ({"g": (2.0, 1.0)}, {}, r"ranges.g=\(2.0, 1.0\): low=2.0 must be below"),
@@ -246,16 +295,18 @@ NO_ITEMS: list[tuple[Any, dict[str, Any], str]] = [
     (3.0, {}, "count=3.0: must be a whole number"),
     (4, {"target": np.array([True, False])}, r"target=\[True, False\]: must be places"),
     (4, {"target": np.array([1.0])}, r"target=\[1.0\]: must be places from 0 to 3"),
-    (2, {"features": np.array([[HUGE], [0]])}, r"features=\[2, 1\]: .* finite"),
+    (2, {"features": np.array([[HUGE], [0]])}, "features=1e[+]39: must be finite"),
     (1, {"features": pd.DataFrame({"a": [{}]})}, "features.*: must be numbers"),
     (2, {"features": {"a": ["x", "y"], "b": [1]}}, r"features=\['a', 'b'\]: .* of one length"),
     (2, {"features": {"a": ["x", "y"], "b": [1, {}]}}, "features.b=.*: must be numbers or texts"),
-    (2, {"features": {"a": ["x", "y"], "b": [1, NAN]}}, r"features=\[2, 3\]: .* finite"),
+    (2, {"features": {"a": ["x", "y"], "b": [1, NAN]}}, "features=nan: .* as of item 1"),
     (2, {"features": [["a", 1], ["b"]]}, "features: must have rows of one length"),
     (300, {"features": [*map(str, range(300))]}, "features.0: has 300 texts that differ; .* 256"),
     (2, {"pass_rates": [0.5]}, r"pass_rates=\[1\]: must be one for each of 2"),
     (2, {"pass_rates": [0.5, 1.5]}, "pass_rates=1.5: must be from 0 to 1, or NaN"),
     (2, {"pass_rates": "often"}, "pass_rates='often': must be numbers"),
+    (2, {"features": [1.0, 2.0]}, r"features=\[2\]: must be \[2, D\], a row for each item"),
+    (2, {"features": {"a": 3}}, "features.a=3: must be a column"),
 ]  # fmt: skip
 NO_LEVELS: list[tuple[Any, dict[str, Any], str]] = [
     (lambda n: np.array(["a"] * n), {}, "draw=ndarray: must give a tensor, a tensordict"),
@@ -266,12 +317,31 @@ NO_LEVELS: list[tuple[Any, dict[str, Any], str]] = [
 NO_TEACHER: list[tuple[Any, dict[str, Any], str]] = [
     (LINE, {"seed": True}, "seed=True: must be a whole number"),
     (LINE, {"block": np.float64(3)}, "block=3.0: input should be a valid int"),
+    (LINE, {"device": "gpu"}, "device=gpu: must be one that torch has here"),
+    (LINE, {"device": "cuda:99"}, "device=cuda:99: must be one that torch has here"),
+    (LINE, {"sing": abs}, "sing: unknown; there are: play, "),
+    ({"s": (0.0, 1.0)}, {}, "space={'s': .*: must be Parameters, Items"),
+]
+NO_CURRICULUM: list[tuple[Any, dict[str, Any], str]] = [
+    ("prl", {"space": LINE}, "curriculum='prl': must be .* one of accel"),
+    (prl.curricula.plr, {"space": LINE}, "curriculum=<function plr .*: must be prl.curricula.NAME"),
+]
+PAIRS = prl.LevelGenerator(lambda n, g: torch.ones(n, 2), target=lambda n, g: torch.ones(n, 3))
+NO_GENERATOR: list[tuple[Any, dict[str, Any], str]] = [
+    (5, {}, "draw=5: must be a function"),
+    (torch.rand, {"target": 5}, "target=5: must be a function"),
+    (torch.rand, {"named": {"all": torch.rand}}, "named.all: must have another name"),
 ]
 NOT_THERE = [
     *((prl.Parameters, *row) for row in NO_PARAMETERS),
     *((prl.Items, *row) for row in NO_ITEMS),
     *((draws, *row) for row in NO_LEVELS),
     *((partial(prl.Teacher, "plr"), *row) for row in NO_TEACHER),
+    *((prl.Teacher, *row) for row in NO_CURRICULUM),
+    *((prl.LevelGenerator, *row) for row in NO_GENERATOR),
+    (partial(prl.MadeLevels, NINE), 5, {}, "make=5: must be a function"),
+    (partial(prl.MadeLevels, NINE), abs, {"features": 5}, "features=5: must be a function"),
+    (prl.Teacher("adaptive_mixture", PAIRS).ask, 9, {}, r"target={'level': \[3\]}: must give .*2"),
 ]
 
 

@@ -517,6 +517,20 @@ REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
         lambda t: t.observe(TensorDict({"next": {"done": torch.ones(4, 3, 1)}}, [4, 3])),
         "rollout: has no level_id",
     ),
+    "no return": (lambda t: t.tell(0, None, 1), "return_=None: must be a number"),
+    "no returns": (lambda t: t.tell([0, 1], None, [1, 1]), r"return_: has shape \[\], but"),
+    "an outcome without names": (
+        lambda t: [t.propose(4), t.observe([0.0] * 4)],
+        r"outcome=\[0.0, .*: must have results by name",
+    ),
+    "a result that there is not": (
+        lambda t: observe(t, **{"return": ZEROS, "success": ZEROS, "sucess": ZEROS}),
+        "outcome.sucess: unknown; there are: return, success",
+    ),
+    "a state that is none": (
+        lambda t: t.load_state_dict({"teacher": t.state_dict()}),
+        "state={'teacher': .*: must be of Teacher.state_dict",
+    ),
     "asked for less than none": (lambda t: t.ask(-1), "n=-1: must be a whole number"),
     "proposed none": (lambda t: t.propose(0), "n=0: must be a whole number, at"),
 }
@@ -605,7 +619,7 @@ UNFIT: list[tuple[Callable[[], Any], type[Exception], str]] = [
         for name in OF_TASKS
     ),
     (lambda: prl.Teacher("target", NO_TARGET), ArgumentError, "target: missing"),
-    (lambda: prl.Teacher("plrr", SPACE), AttributeError, "there is no 'plrr'"),
+    (lambda: prl.Teacher("plrr", SPACE), ArgumentError, "curriculum='plrr': must be .* accel, "),
     (
         lambda: prl.Teacher("target", SPACE, filter="hard"),
         ArgumentError,
@@ -634,7 +648,7 @@ UNFIT: list[tuple[Callable[[], Any], type[Exception], str]] = [
             ),
             (
                 lambda: prl.Items(2, features=torch.tensor([[0], [NAN]])),
-                r"features=\[2, 1\]: .*fin",
+                "features=nan: must be finite",
             ),
         )
     ),

@@ -203,6 +203,8 @@ def test_environments_in_other_processes_have_one_teacher(monkeypatch: pytest.Mo
     [
         (lambda: taught(prl.Teacher("domain_randomization", ITEMS, students=2)), "teacher: of 2"),
         (lambda: taught(counted("rollout")), "tell=True: this curriculum"),
+        (lambda: prl.LevelTransform(counted(), {"a": "b"}), "set_level={'a': 'b'}: must be a func"),
+        (lambda: prl.LevelTransform(counted(), print, success=1), "success=1: must be an entry of"),
     ],
 )
 def test_what_cannot_be_taught_is_refused(make: Any, message: str) -> None:
