@@ -19,5 +19,6 @@ from proposer_rl.task.protocols import distribution_of as distribution_of
 from proposer_rl.task.protocols import for_copies as for_copies
 from proposer_rl.task.protocols import level_inputs as level_inputs
 from proposer_rl.task.protocols import named as named
-from proposer_rl.task.protocols import refuse_single_bin as refuse_single_bin
+from proposer_rl.task.protocols import refuse_many_bins as refuse_many_bins
+from proposer_rl.task.protocols import refuse_unfit_bins as refuse_unfit_bins
 from proposer_rl.task.protocols import space_features as space_features

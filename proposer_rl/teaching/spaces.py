@@ -22,6 +22,7 @@ from proposer_rl.task import Distribution, Levels, space_features
 from proposer_rl.tasks.parameters import SEED, Bins, Law, ParameterSpace
 from proposer_rl.tasks.ranges import python_values, read_line, read_part, target_in_file
 from proposer_rl.teaching.tables import (
+    doubles,
     expected_log_odds,
     few_columns,
     item_table,
@@ -473,7 +474,7 @@ def _taken(name: str, levels: Any, count: int) -> Levels:
 def _rates(given: Any, count: int) -> Tensor:
     """Returns pass rates, float64 [N]."""
     try:
-        rates = torch.as_tensor(np.array(given, dtype=np.float64))
+        rates = doubles(given)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ArgumentError(f"pass_rates={shown(given)}: must be numbers [N]") from error
     if rates.shape != (count,):

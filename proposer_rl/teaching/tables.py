@@ -53,7 +53,7 @@ def item_table(features: Any) -> Table:
     columns = _columns(features)
     texts = [_begins_with_text(column) for column in columns.values()]
     if not columns or (not any(texts) and hasattr(features, "__array__")):
-        return Table(number_table(features), None)
+        return Table(number_table(features).detach().cpu(), None)
     if len({len(column) for column in columns.values()}) > 1:
         raise ArgumentError(f"features={[*columns]}: must have columns of one length")
     parts, codes = [], []
@@ -93,10 +93,21 @@ def _begins_with_text(cells: Any) -> bool:
     return any(isinstance(cell, str) for cell in inner)
 
 
+def doubles(cells: Any) -> Tensor:
+    """Returns numbers as float64 on the CPU, whatever they are given as and wherever they are.
+
+    Raises:
+        TypeError, ValueError, RuntimeError: if they are no numbers.
+    """
+    if isinstance(cells, Tensor):
+        return cells.detach().cpu().double()
+    return torch.from_numpy(np.array(cells, dtype=np.float64))
+
+
 def _numbers(name: str, column: Any) -> Tensor:
     cells = column if hasattr(column, "__array__") else [*column]
     try:
-        return torch.from_numpy(np.array(cells, dtype=np.float64)).reshape(len(cells), -1)
+        return doubles(cells).reshape(len(cells), -1)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ArgumentError(f"{name}={shown(column)}: must be numbers or texts") from error
 
