@@ -16,7 +16,7 @@ from proposer_rl.curricula.student import Student
 from proposer_rl.meta.actions import systematic_draw
 from proposer_rl.settings import Count, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import NoSuccessError, Space, refuse_single_bin
+from proposer_rl.task import NoSuccessError, Space, refuse_unfit_bins
 
 Measure = Literal["success", "return"]
 MANY = 10_000  # levels of a scoring pass, beyond which there is a warning
@@ -39,7 +39,7 @@ class BinCurriculum(Curriculum):
 
     @checked
     def __init__(self, space: Space, *, every: Count) -> None:
-        refuse_single_bin(space)
+        refuse_unfit_bins(space)
         self.space, self._every = space, every
         self._proposed = 0
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back

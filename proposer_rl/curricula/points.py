@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
@@ -12,9 +13,10 @@ from torch import Tensor
 
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
-from proposer_rl.task import Levels, Space, refuse_single_bin
+from proposer_rl.task import Levels, Space, refuse_many_bins, refuse_unfit_bins
 
 CHUNK = 2**16  # places that are compared at once
+MANY = 100_000  # bins, among which the nearest takes long
 Place = Annotated[float, Interval(ge=-1, le=1)]
 """Where a parameter lies in its range, from -1 to 1."""
 
@@ -31,7 +33,8 @@ class Points:
         size: the number D of coordinates.
 
     Raises:
-        ValueError: if the space has a single bin, or no levels at points where these are asked for.
+        ValueError: if the space has a single bin or too many, or no levels at points where these
+            are asked for.
     """
 
     def __init__(self, space: Space, rounded: bool) -> None:
@@ -45,7 +48,14 @@ class Points:
                 "give its axes bins, or rounded=false"
             )
         if not space.axes:
-            refuse_single_bin(space)
+            refuse_unfit_bins(space)
+        refuse_many_bins(space)
+        if space.size > MANY:
+            warnings.warn(
+                f"space: {space.size:,} bins, all of which every level is compared with, which is "
+                "slow; give its axes fewer, such as bins=1 with rounded=false",
+                stacklevel=2,
+            )
         self._space, self._rounded = space, rounded
         self.size: int = space.coordinates.shape[1]
 

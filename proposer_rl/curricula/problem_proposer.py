@@ -24,7 +24,7 @@ from proposer_rl.meta.first_order import TargetMeasure
 from proposer_rl.models import ActorCritic, draw_at
 from proposer_rl.settings import Count, Decay, Positive, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import Distribution, Levels, Space, refuse_single_bin
+from proposer_rl.task import Distribution, Levels, Space, refuse_unfit_bins
 
 
 class ProblemProposer(Curriculum):
@@ -60,7 +60,7 @@ class ProblemProposer(Curriculum):
         *,
         probe_levels: int = 16,
     ) -> None:
-        refuse_single_bin(space)
+        refuse_unfit_bins(space)
         self.agent, self.space, self.target = agent, space, target
         self._settings, self._probe_levels = settings, probe_levels
         actor, _ = agent.readout()

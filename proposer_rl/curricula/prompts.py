@@ -12,6 +12,7 @@ See :class:`~proposer_rl.curricula.AdaptiveMixture` for one that is.
 from __future__ import annotations
 
 import math
+import warnings
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Sequence
@@ -23,12 +24,12 @@ from torch import Tensor
 
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.outcome_model import calibration
-from proposer_rl.curricula.scores import mixed
+from proposer_rl.curricula.scores import mixed, single
 from proposer_rl.curricula.student import Student
 from proposer_rl.meta.actions import systematic_draw
 from proposer_rl.settings import ArgumentError, Decay, Positive, Share, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import Space, refuse_single_bin
+from proposer_rl.task import Space, refuse_unfit_bins
 
 LOGGED = 100  # batches at most, whose predictions a log is about
 PRIOR = math.pi**2 / 16 - 0.5  # variance of the arc length of a probability that is uniform
@@ -47,7 +48,7 @@ class ItemCurriculum(Curriculum):
     remembers: ClassVar[tuple[str, ...]] = ("_inbox", "numbers")
 
     def __init__(self, space: Space) -> None:
-        refuse_single_bin(space)
+        refuse_unfit_bins(space)
         self.space = space
         self.numbers: dict[str, Tensor] = {}  # each [K, ...]; none before the first proposal
         self._inbox = Inbox()
@@ -253,7 +254,7 @@ class CategoryBandit(ItemCurriculum):
             raise ArgumentError(
                 "features: have no texts: this curriculum needs a category of each item"
             )
-        self._categories = categories
+        self._categories, self._warned = categories, False
         self._rate, self._temperature = rate, temperature
 
     def first_numbers(self, students: int) -> dict[str, Tensor]:
@@ -278,7 +279,15 @@ class CategoryBandit(ItemCurriculum):
         category, p = self._categories[seen["item"]], seen["success"]
         zero = torch.zeros_like(own["value"])
         number = zero.index_add(0, category, torch.ones_like(p))
-        reward = zero.index_add(0, category, 2 * (p * (1 - p)).sqrt()) / number.clamp(min=1)
+        spread = 2 * (p * (1 - p)).sqrt()
+        if not self._warned and single(seen["count"]) and not spread.any():
+            self._warned = True
+            warnings.warn(
+                "sec: a single answer has no advantage, so that all categories stay alike; tell "
+                "episodes= of several",
+                stacklevel=2,
+            )
+        reward = zero.index_add(0, category, spread) / number.clamp(min=1)
         own["value"].lerp_(reward, self._rate * (number > 0).double())
 
     def log(self) -> dict[str, Any]:

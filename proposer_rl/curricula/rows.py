@@ -18,7 +18,7 @@ from proposer_rl.curricula.points import measured
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import ArgumentError, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import Space
+from proposer_rl.task import Space, refuse_many_bins
 
 
 class RowsCurriculum(Curriculum):
@@ -70,6 +70,7 @@ class RowsCurriculum(Curriculum):
         self._rows = sizes[axis]
         if self._rows < 2:
             raise ArgumentError(f"row={name}: has a single row; give it bins")
+        refuse_many_bins(space)
         _warn_of_merged(space, name)
         # The number of a bin is (before * rows + row) * after + rest.
         self._before, self._after = prod(sizes[:axis]), prod(sizes[axis + 1 :])

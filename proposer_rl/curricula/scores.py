@@ -42,6 +42,7 @@ the optimum.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pkgutil import resolve_name
 from typing import Any, Literal, NamedTuple
@@ -190,6 +191,7 @@ class Scorer:
     @checked
     def __init__(self, score: str | OwnScore, source: Source, rollouts: Count = 1) -> None:
         self.rollouts, self.from_episodes = rollouts, source == "episodes"
+        self._warned = False
         self._own = _own_score(score)
         self._name = name = score if isinstance(score, str) else score.__qualname__
         available = [*STEPWISE, *READS, "regret"] if self.from_episodes else [*EXACT]
@@ -236,6 +238,7 @@ class Scorer:
             scored = self.of_rollouts(student, [outcome["rollout"]], best)
         else:
             told = {name: entry.cpu() for name, entry in outcome.items()}
+            self._look_at(told.get("episodes", torch.ones(1)))
             scored = _of_returns(self._name, told, best, before)
         if "score" in outcome.keys():
             scored = scored._replace(score=outcome["score"].double().cpu())
@@ -271,6 +274,7 @@ class Scorer:
         elif self._name == "regret":
             score = best - mean
         else:
+            self._look_at(count)
             share = successes.sum(0) / some
             score = mixed(share, some) if self._name == "yield" else share * (1 - share)
         score = score.double().where(count > 0, -torch.inf)
@@ -330,6 +334,16 @@ class Scorer:
         outcome, best = TensorDict(mean, told.shape[1:]), told["return"].amax(0)
         return self.of_outcome(student, outcome, best, before)
 
+    def _look_at(self, answers: Tensor) -> None:
+        """Warns, once, if the yield is of groups of one answer, none of which can be mixed."""
+        if self._name == "yield" and not self._warned and single(answers):
+            self._warned = True
+            warnings.warn(
+                "score=yield: is 0 of a single answer; tell episodes= of several, or use "
+                "learnability",
+                stacklevel=2,
+            )
+
     def _by_own(self, student: Student, outcome: TensorDictBase) -> Tensor:
         """Returns one's own score of an outcome [K, n], float64."""
         assert self._own is not None
@@ -352,6 +366,11 @@ def mixed(p: Tensor, answers: Tensor | float) -> Tensor:
         tensor([0.0000, 0.5000, 0.1800])
     """
     return 1 - p**answers - (1 - p) ** answers
+
+
+def single(answers: Tensor) -> bool:
+    """Returns whether there are groups, numbers of answers, and none of them has several."""
+    return bool((answers == 1).any()) and not bool((answers > 1).any())
 
 
 def _own_score(score: str | OwnScore) -> OwnScore | None:

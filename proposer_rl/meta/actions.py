@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.data import Categorical, TensorSpec, Unbounded
 
 from proposer_rl.streams import Streams
-from proposer_rl.task import Space, refuse_single_bin
+from proposer_rl.task import Space, refuse_unfit_bins
 
 
 class Actions(ABC):
@@ -28,7 +28,7 @@ class Actions(ABC):
     """
 
     def __init__(self, space: Space) -> None:
-        refuse_single_bin(space)
+        refuse_unfit_bins(space)
         self.space = space
         self.bins = space.size
 

@@ -21,6 +21,7 @@ from proposer_rl.models import ActorCritic
 from proposer_rl.settings import ArgumentError
 
 MANY_BINS = 256  # beyond which a model of outcomes has no coefficient for each of them
+MOST_COUNTED = 100_000_000  # bins
 
 Levels = Any
 """A tensordict or tensorclass of levels."""
@@ -307,12 +308,26 @@ def check_distributions(known: Mapping[str, Any], target: str, measured: Sequenc
             raise ValueError(f"{key}: must be among {sorted(known)}, got {unknown[0]!r}")
 
 
-def refuse_single_bin(space: Space) -> None:
-    """Refuses a space in which there is nothing to choose.
+def refuse_many_bins(space: Space) -> None:
+    """Refuses a space of more bins than can be counted one by one.
 
     Raises:
-        ValueError: if it has one bin.
+        ArgumentError: if it has more than ``MOST_COUNTED``.
     """
+    if space.size > MOST_COUNTED:
+        raise ArgumentError(
+            f"space: {space.size:,} bins: at most {MOST_COUNTED:,}, each of which is counted; give "
+            "its axes fewer, such as bins=1 with rounded=false where a curriculum has that"
+        )
+
+
+def refuse_unfit_bins(space: Space) -> None:
+    """Refuses a space in which there is nothing to choose, or too much.
+
+    Raises:
+        ValueError: if it has one bin, or see :func:`refuse_many_bins`.
+    """
+    refuse_many_bins(space)
     if space.size < 2:
         raise ValueError(
             "the space has a single bin, so there is nothing to choose among; give its axes bins"

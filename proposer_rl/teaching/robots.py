@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any
@@ -47,6 +48,12 @@ class LevelTerm:
         self.teacher = self.make_teacher()
         self.tickets = torch.full((env.num_envs,), NONE, device=env.device)
         self._levels: Any = None
+        if hasattr(env, "taught"):
+            warnings.warn(
+                "env.taught: was another term, whose teacher checkpoints leave out now; one "
+                "teacher may have the parameters of both",
+                stacklevel=2,
+            )
         env.taught = self
 
     @abstractmethod
@@ -55,7 +62,10 @@ class LevelTerm:
 
     @abstractmethod
     def results(self, env_ids: Tensor) -> tuple[Any, Any]:
-        """Returns return and success of the episodes that have ended, [n] each; or None for one."""
+        """Returns return and success of the episodes that have ended, [n] each.
+
+        Success may be None, where the curriculum reads none.
+        """
 
     @abstractmethod
     def set_levels(self, env_ids: Tensor, levels: Any) -> None:
@@ -65,8 +75,13 @@ class LevelTerm:
         """Does nothing: a manager calls it after the term itself."""
 
     def __call__(self, env: Any, env_ids: Any) -> dict[str, Tensor]:
-        """Tells what came of environments, by number or slice, and sets their next levels."""
-        ids = torch.arange(env.num_envs, device=env.device)[env_ids]
+        """Tells what came of environments, and sets their next levels.
+
+        Args:
+            env: the environment.
+            env_ids: numbers, a mask or a slice; None for all.
+        """
+        ids = torch.arange(env.num_envs, device=env.device)[env_ids].reshape(-1)
         once, counts = ids.unique(return_counts=True)
         if len(once) < len(ids):
             raise ArgumentError(f"env_ids={int(once[counts > 1][0])}: is there more than once")
@@ -81,7 +96,7 @@ class LevelTerm:
         self.tickets[ids], levels = asked.to(env.device), levels.to(env.device)
         if self._levels is None:
             with torch.inference_mode(False):  # rsl_rl steps environments within it
-                self._levels = levels[:1].expand(env.num_envs, *levels.shape[1:]).clone()
+                self._levels = levels.new_zeros(env.num_envs, *levels.shape[1:])
         self._levels[ids] = levels
         self.set_levels(ids, levels)
         return _means(self._levels[self.tickets != NONE])
@@ -93,9 +108,9 @@ class LevelTerm:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Puts it back; what is played now counts for nothing."""
         self.teacher.drop()
+        self.tickets.fill_(NONE)
         self.teacher.load_state_dict(state)
         self.teacher.drop()  # what others played
-        self.tickets.fill_(NONE)
 
 
 class TaughtRunner:
@@ -104,27 +119,46 @@ class TaughtRunner:
     To be named before the runner, of ``rsl_rl`` or mjlab:
 
         class Runner(prl.TaughtRunner, OnPolicyRunner): ...
+
+    Raises:
+        ArgumentError: if it is named after one, which would then save no teacher.
     """
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        for one in cls.__mro__[: cls.__mro__.index(TaughtRunner)]:
+            if "save" in vars(one) and not issubclass(one, TaughtRunner):
+                raise ArgumentError(f"{cls.__name__}: name TaughtRunner before {one.__name__}")
+
     @property
-    def _term(self) -> LevelTerm:
+    def _term(self) -> LevelTerm | None:
         env = vars(self)["env"]
-        term: LevelTerm = getattr(env, "unwrapped", env).taught
+        term: LevelTerm | None = getattr(getattr(env, "unwrapped", env), "taught", None)
         return term
 
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
-        """Saves a checkpoint, whose ``infos`` have the teacher's state as ``teacher``."""
+        """Saves a checkpoint, whose ``infos`` have the teacher's state as ``teacher``.
+
+        Raises:
+            ArgumentError: if the environment has no term.
+        """
+        if self._term is None:
+            raise ArgumentError("env: has no LevelTerm; name one in the config of its curriculum")
         parent: Any = super()
         parent.save(path, {**(infos or {}), "teacher": self._term.state_dict()})
 
     def load(self, path: str, *args: Any, **kwargs: Any) -> Any:
         """Loads one, and returns its ``infos``.
 
+        An environment without a term, in which a policy is but played, needs no teacher.
+
         Raises:
-            ArgumentError: if it has no teacher.
+            ArgumentError: if there is a term, and no teacher in the checkpoint.
         """
         parent: Any = super()
         infos = parent.load(path, *args, **kwargs)
+        if self._term is None:
+            return infos
         if "teacher" not in (infos or {}):
             raise ArgumentError(f"path={path}: has no teacher; another runner has saved it")
         self._term.load_state_dict(infos["teacher"])

@@ -64,7 +64,8 @@ class TeacherSampler(Sampler[int]):
         sources: where each item is from, [N], by which :meth:`metrics` are given, too.
 
     Raises:
-        ArgumentError: if the teacher's levels are no items, or not each has a source.
+        ArgumentError: if the teacher's levels are no items, or those of several students, or not
+            each has a source.
     """
 
     @checked
@@ -78,8 +79,7 @@ class TeacherSampler(Sampler[int]):
         rounds: Count = 1,
         sources: Any = None,
     ) -> None:
-        if not isinstance(teacher.space, Items):
-            raise ArgumentError("teacher: must have a space of Items")
+        require_items(teacher)
         if sources is not None and len(sources) != teacher.space.size:
             raise ArgumentError(f"sources: {len(sources)} for {teacher.space.size} items")
         self._teacher, self._length = teacher, length
@@ -317,11 +317,10 @@ def mixed_groups(
         most: calls of it, after which there may be fewer groups.
 
     Raises:
-        ArgumentError: if its results are no such numbers, whose items are dropped then; if the
-            teacher's levels are no items.
+        ArgumentError: if its results are no such numbers, or G is 1 or another than before, whose
+            items are dropped then; if the teacher's levels are no items of one student.
     """
-    if not isinstance(teacher.space, Items):
-        raise ArgumentError("teacher: must have a space of Items")
+    require_items(teacher)
     drawn: list[int] = []
     groups: list[Tensor] = []
     places: list[int] = []
@@ -329,12 +328,10 @@ def mixed_groups(
     for _ in range(most):
         tickets, items = teacher.ask(count - len(places))
         try:
-            success = torch.as_tensor(generate(items.tolist())).double().cpu()
-            if success.ndim != 2 or len(success) != len(items):
-                shape = list(success.shape)
-                raise ArgumentError(f"generate={shape}: must give results [{len(items)}, G]")
-            if not ((success >= 0) & (success <= 1)).all():
-                raise ArgumentError("generate: must give results from 0 to 1")
+            success = _of_groups(generate(items.tolist()), len(items))
+            if groups and success.shape[1] != groups[0].shape[1]:
+                sizes = f"{success.shape[1]} answers, first {groups[0].shape[1]}"
+                raise ArgumentError(f"generate: must give groups of one size: {sizes}")
             means = success.mean(1)
             teacher.tell(tickets, means, means, episodes=success.shape[1])
         except BaseException:
@@ -351,6 +348,32 @@ def mixed_groups(
     return MixedGroups(
         [drawn[place] for place in places], torch.cat(groups)[chosen], chosen, rollouts
     )
+
+
+def require_items(teacher: Teacher) -> None:
+    """Refuses a teacher of other levels than items, or of several students.
+
+    Raises:
+        ArgumentError: in one line.
+    """
+    if not isinstance(teacher.space, Items) or teacher.students > 1:
+        raise ArgumentError("teacher: must have a space of Items, and one student")
+
+
+def _of_groups(given: Any, count: int) -> Tensor:
+    """Returns the success of answers to so many items, float64 [n, G]."""
+    try:
+        if isinstance(given, list | tuple):
+            given = [row.tolist() if isinstance(row, Tensor) else row for row in given]
+        success = torch.as_tensor(given).detach().double().cpu()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ArgumentError("generate: must give numbers [n, G]") from error
+    if success.ndim != 2 or len(success) != count or success.shape[1] < 2:
+        shape = list(success.shape)
+        raise ArgumentError(f"generate={shape}: must give results [{count}, G], G at least 2")
+    if not ((success >= 0) & (success <= 1)).all():
+        raise ArgumentError("generate: must give results from 0 to 1")
+    return success
 
 
 def _everywhere(read: Callable[[], list[T]], trace: int) -> list[T]:
@@ -394,7 +417,7 @@ def _answers(
             raise ArgumentError(f"success={share:g}: must be from 0 to 1")
         if number is None or not isfinite(number):
             raise ArgumentError(f"return_={number}: must be finite")
-        if count is None or not (count >= 1 and count == int(count)):
+        if count is None or not (1 <= count < inf and count == int(count)):
             raise ArgumentError(f"episodes={count}: must be a whole number from 1")
         answers.append((item, Answer(share, number, count)))
     return answers

@@ -28,9 +28,9 @@ from proposer_rl.tasks.ranges import (
     target_in_file,
 )
 from proposer_rl.teaching.tables import (
+    doubles,
     expected_log_odds,
     few_columns,
-    float_array,
     item_table,
     number_table,
     rate_columns,
@@ -518,7 +518,7 @@ def _taken(name: str, levels: Any, count: int) -> Levels:
 def _rates(given: Any, count: int) -> Tensor:
     """Returns pass rates, float64 [N]."""
     try:
-        rates = torch.from_numpy(float_array(given))
+        rates = doubles(given)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ArgumentError(f"pass_rates={shown(given)}: must be numbers [N]") from error
     if rates.shape != (count,):

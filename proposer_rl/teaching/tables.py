@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from proposer_rl.curricula.belief import WIDEST
@@ -56,7 +55,7 @@ def item_table(features: Any) -> Table:
     columns = _columns(features)
     texts = [_begins_with_text(column) for column in columns.values()]
     if not columns or (not any(texts) and hasattr(features, "__array__")):
-        return Table(number_table(features).cpu(), None)
+        return Table(number_table(features).detach().cpu(), None)
     for name, column in columns.items():
         if not hasattr(column, "__len__"):
             raise ArgumentError(f"features.{name}={shown(column)}: must be a column, [N]")
@@ -105,18 +104,21 @@ def _is_missing(cell: Any) -> bool:
     return cell is None or (isinstance(cell, float) and math.isnan(cell))
 
 
-def float_array(numbers: Any) -> NDArray[np.float64]:
-    """Returns a copy of numbers, also of tensors with a gradient, on a GPU or of bfloat16."""
-    if isinstance(numbers, Tensor):
-        numbers = numbers.detach().cpu().double()
-        return numbers.numpy().copy()
-    return np.array(numbers, dtype=np.float64)
+def doubles(cells: Any) -> Tensor:
+    """Returns numbers as float64 on the CPU, whatever they are given as and wherever they are.
+
+    Raises:
+        TypeError, ValueError, RuntimeError: if they are no numbers.
+    """
+    if isinstance(cells, Tensor):
+        return cells.detach().cpu().double()
+    return torch.from_numpy(np.array(cells, dtype=np.float64))
 
 
 def _numbers(name: str, column: Any) -> Tensor:
     cells = column if hasattr(column, "__array__") else [*column]
     try:
-        return torch.from_numpy(float_array(cells)).reshape(len(cells), -1)
+        return doubles(cells).reshape(len(cells), -1)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ArgumentError(f"{name}={shown(column)}: must be numbers or texts") from error
 

@@ -229,6 +229,8 @@ class Teacher:
         with self._here():
             if "rollout" in self.reads:
                 raise ArgumentError("tell: this curriculum reads rollouts; use observe(rollout)")
+            if return_ is None:
+                raise ArgumentError("return_: missing: of each level, such as its success")
             if success is None:
                 self._require_success(False, "tell it with success=")
             if self._alone and isinstance(ids, int):

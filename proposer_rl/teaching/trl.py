@@ -14,8 +14,7 @@ from transformers import TrainerCallback
 
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.settings import ArgumentError
-from proposer_rl.teaching.sampler import TeacherSampler
-from proposer_rl.teaching.spaces import Items
+from proposer_rl.teaching.sampler import TeacherSampler, require_items
 from proposer_rl.teaching.teacher import Teacher
 
 ROW = "teacher_item"  # the column of the training set that says which row it is
@@ -42,7 +41,8 @@ class TaughtReward(TrainerCallback):
         source: the column of the training set by which metrics are logged, too; None for none.
 
     Raises:
-        ArgumentError: if the teacher's levels are no items, or the function is a coroutine.
+        ArgumentError: if the teacher's levels are no items of one student, or the reward is no
+            function, or a coroutine.
     """
 
     _trainer: Any = None
@@ -56,11 +56,11 @@ class TaughtReward(TrainerCallback):
         reward: Callable[..., Sequence[float | None]],
         source: str | None = None,
     ) -> None:
-        if not isinstance(teacher.space, Items):
-            raise ArgumentError("teacher: must have a space of Items")
-        if iscoroutinefunction(reward):
-            raise ArgumentError("reward: must be no coroutine: ranks are told in step")
-        self._teacher, self._rows, self._reward = teacher, teacher.space.size, reward
+        require_items(teacher)
+        if not callable(reward) or iscoroutinefunction(reward):
+            raise ArgumentError("reward: must be a function, no coroutine: ranks are told in step")
+        space: Any = teacher.space
+        self._teacher, self._rows, self._reward = teacher, space.size, reward
         self._source = source
         self._told = 0  # generations
         self._again = False  # whether the next one repeats the last that was reported

@@ -53,10 +53,13 @@ class TaughtSampler(TeacherSampler, AbstractCurriculumSampler):
         self._places = {key: place for place, key in enumerate(keys)}
         if len(self._places) < len(keys):
             raise ArgumentError("extra_info.index: must differ within a data_source")
-        features = {name: column(name) for name in told.get("features") or ()}
+        named = told.get("features") or ()
+        features = {name: column(name) for name in ([named] if isinstance(named, str) else named)}
         rates = column(told.get("pass_rates"))
         items = Items(len(keys), features=features or None, pass_rates=rates)
         batch = data_config.get("gen_batch_size") or data_config.train_batch_size
+        if batch > len(keys):
+            raise ArgumentError(f"data.train_batch_size={batch}: is more than {len(keys)} prompts")
         make = recipe_function("method", told.get("method") or DEFAULT_METHOD)
         recipe = make(**(told.get("settings") or {}))
         teacher = Teacher(recipe, items, seed=data_config.get("seed") or 0, block=batch)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from itertools import product
 from typing import Any
@@ -90,6 +91,23 @@ def test_sec_values_categories_by_how_much_their_groups_differ() -> None:
     found = np.bincount(drawn, minlength=6).reshape(3, 2) / 1200
     assert found.sum(1) == pytest.approx(shares / shares.sum(), abs=0.01)
     assert found[:, 0] == pytest.approx(found[:, 1], abs=0.05)
+
+
+@pytest.mark.parametrize("recipe", [prl.curricula.sec(), prl.curricula.plr(score="yield")])
+def test_single_answers_that_can_teach_nothing_are_named_once(recipe: Any) -> None:
+    space = prl.Items(6, features={"source": [*"aabbcc"]})
+    for success, answers in ((1.0, 8), (1.0, 1)):
+        teacher = prl.Teacher(recipe, space, block=3)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            for _ in range(3):
+                tickets, _ = teacher.ask(3)
+                teacher.tell(tickets, [success] * 3, [success] * 3, episodes=answers)
+        lines = [str(one.message) for one in told]
+        assert len(lines) == (answers == 1)
+        assert all(
+            "single answer" in line and "tell episodes= of several" in line for line in lines
+        )
 
 
 def test_a_groups_arc_length_has_a_variance_that_does_not_depend_on_p() -> None:

@@ -15,6 +15,7 @@ from proposer_rl.curricula import (
     AdaptiveDifficulty,
     ArcLengthFilter,
     BetaSampling,
+    BoundsCurriculum,
     CategoryBandit,
     Curriculum,
     Filtered,
@@ -25,6 +26,7 @@ from proposer_rl.curricula import (
     MixtureCurriculum,
     ReplayCurriculum,
     ReplayRule,
+    RowsCurriculum,
     SampledFirstOrderCurriculum,
     SamplingCurriculum,
     Schedule,
@@ -166,6 +168,12 @@ def test_what_bins_cost_or_lack_is_told_first() -> None:
         LearningProgressCurriculum(many)
     with pytest.warns(UserWarning, match="5,000 bins with 8 candidates each: 40,000 levels"):
         FirstOrderCurriculum(many, many)
+    wide = ParameterSpace({str(axis): intervals(0.0, 1.0, 8) for axis in range(9)})
+    for maker in (RowsCurriculum, BoundsCurriculum, BetaSampling, LearningProgressCurriculum):
+        with pytest.raises(ArgumentError, match="134,217,728 bins: at most 100,000,000"):
+            maker(wide)
+    with pytest.warns(UserWarning, match="262,144 bins, all of which every level is compared"):
+        BoundsCurriculum(ParameterSpace({str(axis): intervals(0.0, 1.0, 8) for axis in range(6)}))
     with pytest.raises(ValueError, match=r"parameters: .* combinations of their bins"):
         ParameterSpace({str(axis): intervals(0.0, 1.0, 256) for axis in range(8)})
     with warnings.catch_warnings():

@@ -108,7 +108,7 @@ def loaded(sampler: Any) -> Any:
 @pytest.mark.parametrize("success", [None, "acc"])
 def test_verl_reports_whole_groups(taught_sampler: Any, success: str | None) -> None:
     """Of all batches of two epochs, none of which is a part; means and counts by hand."""
-    settings = {"method": "mopps", "features": ["extra_info.level"], "source": "data_source"}
+    settings = {"method": "mopps", "features": "extra_info.level", "source": "data_source"}
     sampler = verl(taught_sampler, **settings, settings={"decay": 0.9}, success=success)
     assert sampler._teacher._made_of["decay"] == 0.9
     places = sampler._teacher.space.coordinates.flatten().tolist()
@@ -151,11 +151,14 @@ def test_verl_goes_on_from_the_checkpoint_of_its_loader(taught_sampler: Any) -> 
 
 SAME = Prompts()
 SAME.dataframe["extra_info"] = [{"index": 0}] * ROWS
+FEW = Prompts()
+FEW.dataframe = {name: column[:3] for name, column in FEW.dataframe.items()}
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a setting": ({"methods": "mopps"}, "data.sampler.methods: unknown; there are: method, "),
     "a column": ({"features": ["extra_info.size"]}, "data: has no column extra_info.size"),
     "a source": ({"source": "family"}, "data: has no column family"),
     "no way to tell": ({"rows": SAME}, "extra_info.index: must differ within a data_source"),
+    "no batch": ({"rows": FEW}, "data.train_batch_size=4: is more than 3 prompts"),
     "a score": ({"success": "right"}, "data.sampler.success=right: a batch has: data_source, "),
     "no share": ({"wrong": True}, "success=-1: must be from 0 to 1"),
 }

@@ -156,6 +156,7 @@ def test_a_state_goes_on_in_other_environments() -> None:
         ([1, 2], (1.0, torch.ones(2)), r"^return_: has shape \[\], but must have \[2\]"),
         ([1, 2], (torch.ones(2), "far"), "^success='far': must be numbers"),
         ([1, 2], (torch.ones(2), None), "^success: missing: this curriculum reads it"),
+        ([1, 2], (None, torch.ones(2)), "^return_: missing: of each level"),
     ],
 )
 def test_what_is_wrong_is_named_and_counts_nothing(
@@ -173,6 +174,76 @@ def test_what_is_wrong_is_named_and_counts_nothing(
     assert (log["told"], log["dropped"], log["out"]) == (0, 0, COUNT)
     assert (term.tickets == before).all()
     assert all((env.levels[name] == x).all() for name, x in levels.items())
+
+
+@pytest.mark.parametrize(
+    ("env_ids", "told"),
+    [
+        (None, 2),
+        (slice(1, 3), 2),
+        (torch.tensor([0, 1, 1, 0, 0, 0], dtype=torch.bool), 2),
+        (torch.tensor([[1], [2]], dtype=torch.int32), 2),
+        (torch.tensor(2), 1),
+        ([], 0),
+    ],
+)
+def test_environments_are_named_as_they_index_a_tensor(env_ids: Any, told: int) -> None:
+    env = Robots()
+    term = Levels(None, env)
+    term(env, [])  # before any level is set
+    term(env, None)
+    assert (term.tickets >= 0).all()
+    env.step([1, 2])
+    term(env, env_ids)
+    assert term.teacher.log()["told"] == told
+
+
+def test_a_refused_state_leaves_a_term_that_goes_on() -> None:
+    class Bounds(Levels):
+        def make_teacher(self) -> prl.Teacher:
+            return prl.Teacher("adr", SPACE, block=1)
+
+    env, other = Robots(), Robots()
+    state, term = Levels(None, env).state_dict(), Bounds(None, other)
+    term(other, None)
+    with pytest.raises(prl.ArgumentError, match="kind was terrain_levels, is adr"):
+        term.load_state_dict(state)
+    term(other, other.step([1, 2]))
+    assert term.teacher.log()["told"] == 0
+    with pytest.warns(UserWarning, match=r"^env\.taught: was another term, whose teacher"):
+        Levels(None, other)
+
+
+class Stock:
+    """What rsl_rl's runner does with ``infos``."""
+
+    def __init__(self, env: Any) -> None:
+        self.env = env
+
+    def save(self, path: str, infos: Any = None) -> None:
+        torch.save({"infos": infos}, path)
+
+    def load(self, path: str, **_: Any) -> Any:
+        return torch.load(path, weights_only=False)["infos"]
+
+
+class Taught(prl.TaughtRunner, Stock):  # type: ignore[misc]
+    pass
+
+
+def test_policies_are_played_without_a_term_and_trained_with_one(tmp_path: Path) -> None:
+    env, path = Robots(), str(tmp_path / "model.pt")
+    Levels(None, env)
+    Taught(env).save(path, {"steps": 3})
+    assert Taught(Robots()).load(path)["steps"] == 3
+    with pytest.raises(prl.ArgumentError, match=r"^env: has no LevelTerm"):
+        Taught(Robots()).save(path)
+    Stock(env).save(path)
+    assert Taught(Robots()).load(path) is None
+    with pytest.raises(prl.ArgumentError, match="has no teacher; another runner has saved it"):
+        Taught(env).load(path)
+    with pytest.raises(prl.ArgumentError, match=r"^Late: name TaughtRunner before Stock$"):
+        type("Late", (Stock, prl.TaughtRunner), {})
 
 
 def test_thousands_of_robots_get_levels_one_by_one() -> None:

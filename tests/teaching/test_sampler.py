@@ -367,8 +367,9 @@ def test_means_of_several_answers_are_weighted_and_say_what_differed() -> None:
     }
     assert not sampler.metrics()
     assert [*sampler]
-    with pytest.raises(ArgumentError, match=r"episodes=0\.5: must be a whole number from 1"):
-        sampler.tell([0], [1.0], episodes=[0.5])
+    for wrong in (0.5, torch.inf):
+        with pytest.raises(ArgumentError, match=f"episodes={wrong}: must be a whole number from 1"):
+            sampler.tell([0], [1.0], episodes=[wrong])
     with pytest.raises(ArgumentError, match="sources: 3 for 4 items"):
         prl.TeacherSampler(teacher, 4, sources="abc")
 
@@ -421,6 +422,10 @@ def test_mixed_groups_are_drawn_until_there_are_enough() -> None:
         (torch.ones(3), r"generate=\[3\]: must give results \[3, G\]"),
         (torch.full((3, 2), 2.0), "generate: must give results from 0 to 1"),
         ([[1, torch.nan]] * 3, "generate: must give results from 0 to 1"),
+        ([[1]] * 3, r"generate=\[3, 1\]: must give results \[3, G\], G at least 2"),
+        ([[1, None]] * 3, r"generate: must give numbers \[n, G\]"),
+        ([[1, 0], [1], [0, 1]], r"generate: must give numbers \[n, G\]"),
+        (None, r"generate: must give numbers \[n, G\]"),
     ],
 )
 def test_what_is_no_result_of_groups_drops_them(given: Any, line: str) -> None:
@@ -429,6 +434,17 @@ def test_what_is_no_result_of_groups_drops_them(given: Any, line: str) -> None:
         prl.mixed_groups(teacher, 3, lambda items: given)
     log = teacher.log()
     assert (log["dropped"], log["out"], log["told"]) == (3, 0, 0)
+
+
+def test_groups_are_of_one_size_and_of_one_student() -> None:
+    teacher = prl.Teacher("domain_randomization", prl.Items(5), block=3)
+    sizes = iter((2, 3))
+    with pytest.raises(ArgumentError, match="groups of one size: 3 answers, first 2"):
+        prl.mixed_groups(teacher, 3, lambda items: [torch.ones(next(sizes))] * len(items))
+    two = prl.Teacher("domain_randomization", prl.Items(5), students=2)
+    for make in (prl.TeacherSampler, lambda *given: prl.mixed_groups(*given, list)):
+        with pytest.raises(ArgumentError, match=r"teacher: must have .* Items, and one student"):
+            make(two, 3)
 
 
 def loop(

@@ -284,7 +284,8 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a stream": ({"train_dataset": iter([])}, "train_dataset: has a stream of rows"),
     "skipping ignored": ({"ignore_data_skip": True}, "ignore_data_skip=True: must be false"),
     "columns removed": ({"remove_unused_columns": True}, "remove_unused_columns=True: must be"),
-    "a coroutine": ({"reward": awaited}, "reward: must be no coroutine"),
+    "a coroutine": ({"reward": awaited}, "reward: must be a function, no coroutine"),
+    "a model's name": ({"reward": "org/model"}, "reward: must be a function, no coroutine"),
     "not attached": ({"attach": False}, "trainer: missing: call attach"),
     "no checkpoint": ({"resume_at": 3}, "resume_from_checkpoint=.*checkpoint-3: has no teacher.pt"),
     "no such column": (
