@@ -12,6 +12,10 @@ from hydra.core.hydra_config import HydraConfig
 
 from proposer_rl.cli.train import main
 
+# Seconds, and less than ``+scale=smoke`` takes alone: nothing is learnt in so little.
+LITTLE = ["solver.ppo.horizon=5", "solver.ppo.epochs=1", "task.network.channels=[8,8]"]
+SMOKE = ["+scale=smoke", "compute.progress=false", *LITTLE]
+
 
 def call(command: Callable[[], object], *arguments: str) -> int:
     """Calls a command that reads the command line; returns its exit code."""

@@ -85,7 +85,7 @@ def closure(project: metadata.Distribution, extra: str) -> set[str]:
 
 
 @cache
-def _installed() -> tuple[dict[str, list[str]], dict[str, set[str]]]:
+def installed() -> tuple[dict[str, list[str]], dict[str, set[str]]]:
     """The files of each distribution, and which of them have files below each first part."""
     from packaging.utils import canonicalize_name
 
@@ -103,7 +103,7 @@ def _installed() -> tuple[dict[str, list[str]], dict[str, set[str]]]:
 
 def _link(required: dict[str, metadata.Distribution], site: Path) -> None:
     """Link whole folders that are only theirs, and file by file those that others write into."""
-    files, owners = _installed()
+    files, owners = installed()
     for name, distribution in required.items():
         assert files[name], f"{name} is installed without a list of its files"
         places = {
@@ -119,7 +119,7 @@ def _link(required: dict[str, metadata.Distribution], site: Path) -> None:
 
 
 RUN = "runs"
-SMALL = ["compute.progress=false", "schedule.updates=2", "schedule.evaluate_every=2"]
+SMALL = ["compute.progress=false", "schedule.updates=1", "schedule.evaluate_every=1"]
 GYMNASIUM = [
     *SMALL, "task.max_steps=16", "task.evaluation.levels=2", "solver.batch_size=2",
     "solver.ppo.horizon=16", "solver.ppo.minibatches=2",
@@ -131,10 +131,10 @@ TASKS = {
     "mujoco": ["half_cheetah"],
 }
 SMOKE = ["+scale=smoke", "compute.progress=false"]
-# Two cycles of what learns, and levels enough that some are replayed; measured at the end alone.
 FEW = [*SMOKE, "schedule.evaluate_every=4", "solver.ppo.horizon=5", "solver.ppo.epochs=1"]
 FEW += ["task.maze.max_steps=5", "task.evaluation.levels=2", "task.network.channels=[8,8]"]
-FEW += ["schedule.updates=4", "proposer.meta_episode_length=2"]
+FEW += ["schedule.updates=1", "proposer.meta_episode_length=2"]
+LONGER = ["schedule.updates=4"]  # two cycles of what learns, and levels enough to be replayed
 
 
 def _trained(name: str, *arguments: str) -> list[str]:
@@ -153,20 +153,22 @@ def commands(extra: str, methods: list[str]) -> Iterator[list[str]]:
         for method in methods:
             if method not in others:
                 yield _trained(method, f"+method={method}", *FEW)
-        # A run goes on; a Proposer that has learnt is taken over.
-        yield _trained("perf_gain", "+method=perf_gain", *FEW, "schedule.updates=6")
+        # Runs go on; a Proposer that has learnt is taken over.
+        for method in ("accel", "perf_gain"):
+            yield _trained(method, f"+method={method}", *FEW, *LONGER)
         yield _trained("frozen", "+method=frozen_proposer", *FEW, f"checkpoint={RUN}/perf_gain")
         yield _trained("views", "task=view_maze_smoke", "+method=robust_plr", *SMALL)
         yield _trained("cartpole", "task=cartpole", "+method=first_order_sampled", *GYMNASIUM)
-        few = ["task.levels=2", "solver.ppo.epochs=1", "pool.candidates=4"]
-        yield _trained("gates", "task=point_mass", "+method=accel", *SMALL, *few)
-        yield _trained("robots", "task=robots", "+method=terrain_levels", *SMALL, *few[:2])
+        few = [*SMALL, "task.levels=2", "task.max_steps=8", "solver.ppo.horizon=8"]
+        yield _trained("gates", "task=point_mass", "+method=domain_randomization", *few)
+        yield _trained("robots", "task=robots", "+method=terrain_levels", *few)
         yield ["watch", RUN, "--once"]
         yield ["report", f"{RUN}/perf_gain", "-o", "report"]
         yield from (["eval", f"{RUN}/{name}", "--levels", "small"] for name in ("target", "views"))
     elif extra == "alp-gmm":
-        # More than 250 episodes, after which a mixture is fitted for the first time.
-        yield _trained("alp_gmm", "+method=alp_gmm", *SMOKE, "solver.batch_size=64")
+        # More episodes than a mixture is fitted after for the first time.
+        few = ["curriculum.warmup=4", "curriculum.refit=4", "curriculum.components=2"]
+        yield _trained("alp_gmm", "+method=alp_gmm", *FEW, *LONGER, *few)
     elif extra in TASKS:
         for task in TASKS[extra]:
             yield _trained(task, f"task={task}", "+method=domain_randomization", *GYMNASIUM)
@@ -205,11 +207,18 @@ def _play(command: Callable[..., Any], arguments: list[str]) -> None:
     assert os.waitpid(server, 0)[1] == 0
 
 
+def _undrawn(folder: Path, title: str) -> Path:
+    """One picture is enough."""
+    return folder / "run.png"
+
+
 def _run(extra: str) -> None:
     from proposer_rl.cli import shown
     from proposer_rl.recipes import available
 
     scripts = {script.name: script for script in metadata.entry_points(group="console_scripts")}
+    if extra not in ("", "tensorboard"):  # which logs it
+        shown.draw_run = _undrawn
     for name, *arguments in commands(extra, available("method")):
         command = scripts[f"proposer-{name}"].load()
         if name == "report":
@@ -221,7 +230,7 @@ def _run(extra: str) -> None:
         else:
             _call(command, name, arguments)
         print("DID", name, *arguments, flush=True)
-        shown.draw_run = lambda folder, title: folder / "run.png"  # one picture is enough
+        shown.draw_run = _undrawn
     if extra == "":
         import gymnasium
 

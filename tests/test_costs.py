@@ -11,6 +11,7 @@ from proposer_rl.experiment import Experiment
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.process import Interrupted, StopSignals
 from proposer_rl.tasks.mazes import MazeEnv
+from tests.commands import LITTLE
 from tests.same_run import StopAt
 from tests.tiny import composed
 
@@ -33,8 +34,13 @@ SPENT = {
 
 
 def experiment(folder: Path, arguments: list[str], signals: StopSignals) -> Experiment:
-    scale = ["+scale=smoke", "compute.progress=false", "solver.ppo.horizon=5", "schedule.updates=4"]
-    scale += ["schedule.cycle_length=2", "proposer.meta_episode_length=2", "task.maze.max_steps=5"]
+    scale = ["+scale=smoke", "compute.progress=false", *LITTLE]
+    scale += [
+        "schedule.updates=4",
+        "schedule.cycle_length=2",
+        "proposer.meta_episode_length=2",
+        "task.maze.max_steps=5",
+    ]
     config = composed(arguments[0], *scale, *arguments[1:])
     return build(config, parts(config, signals), RunFolder(folder), signals)
 

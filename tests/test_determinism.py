@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from tests.commands import SMOKE
 from tests.same_run import assert_same_run, tables, trained
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 
-SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.updates=3"]
+FEW = [*SMOKE, "solver.ppo.epochs=2", "schedule.updates=3"]
 METHODS = ["perf_gain", "target", "adaptive_mixture"]
 
 
@@ -41,7 +42,7 @@ def whole(
 ) -> Path:
     if method not in wholes:
         folder = tmp_path_factory.mktemp(method)
-        assert train(f"+method={method}", *SMOKE, f"hydra.run.dir={folder}") == 0
+        assert train(f"+method={method}", *FEW, f"hydra.run.dir={folder}") == 0
         wholes[method] = folder
     return wholes[method]
 
@@ -56,7 +57,7 @@ def test_no_byte_depends_on_how_it_is_computed_logged_or_saved(
     np.random.seed(123)
     random.seed(123)
     before = torch.get_rng_state(), np.random.get_state()[1].tolist(), random.getstate()
-    assert train(f"+method={method}", *SMOKE, *otherwise, "hydra.run.dir=other") == 0
+    assert train(f"+method={method}", *FEW, *otherwise, "hydra.run.dir=other") == 0
     assert_same_run(whole, Path("other"))
     assert torch.equal(torch.get_rng_state(), before[0])
     assert (np.random.get_state()[1].tolist(), random.getstate()) == before[1:]
@@ -65,7 +66,7 @@ def test_no_byte_depends_on_how_it_is_computed_logged_or_saved(
 @pytest.mark.parametrize("method", METHODS)
 def test_measuring_more_or_less_does_not_change_training(method: str, whole: Path, train) -> None:
     options = ["task.evaluation.levels=3", "schedule.evaluate_every=1"]
-    assert train(f"+method={method}", *SMOKE, *options, "hydra.run.dir=other") == 0
+    assert train(f"+method={method}", *FEW, *options, "hydra.run.dir=other") == 0
     assert_trained_alike(whole, Path("other"))
     assert tables(whole) != tables(Path("other"))
 
@@ -73,13 +74,13 @@ def test_measuring_more_or_less_does_not_change_training(method: str, whole: Pat
 def test_several_threads_give_the_same_bytes_every_time(train) -> None:
     options = ["compute.threads=2", "schedule.updates=2"]
     for name in ("one", "other"):
-        assert train("+method=target", *SMOKE, *options, f"hydra.run.dir={name}") == 0
+        assert train("+method=target", *FEW, *options, f"hydra.run.dir={name}") == 0
     assert_same_run(Path("one"), Path("other"))
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_seed_reaches_every_draw(method: str, whole: Path, train) -> None:
-    assert train(f"+method={method}", *SMOKE, "seed=1", "hydra.run.dir=other") == 0
+    assert train(f"+method={method}", *FEW, "seed=1", "hydra.run.dir=other") == 0
     one, other = trained(whole), trained(Path("other"))
     weights = [name for name in one if name.endswith("/value")]
     # Biases begin at zero whatever the seed, but are trained on other levels by other actions.

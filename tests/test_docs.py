@@ -19,7 +19,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 import proposer_rl as prl
 from proposer_rl.cli.eval import main as evaluate
 from proposer_rl.recipes import CONFIG_FOLDER
-from tests.commands import call, trained_run
+from tests.commands import SMOKE, call, trained_run
 from tests.test_bin import MODULES
 from tests.test_readme import DOCS, README, ROOT, blocks, commands, run, smallest, write_files
 
@@ -157,7 +157,7 @@ def test_the_commands_about_levels_run() -> None:
     """On a Solver of a few updates, and with the file of levels that the page shows."""
     (drawn,) = blocks("text", LEVELS)
     Path("my_levels.txt").write_text(drawn)
-    trained_run(Path("my_run"), "+method=target", "+scale=smoke", "compute.progress=false")
+    trained_run(Path("my_run"), "+method=target", *SMOKE)
     for program, *words in commands(LEVELS):
         assert program == "bin/eval" and call(evaluate, *words) == 0, words
     assert all(Path(file).is_file() for file in ("scores.csv", "paths.png"))

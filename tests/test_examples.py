@@ -22,6 +22,7 @@ from proposer_rl.meta.rewards import TrainingStep
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import Level
+from tests.commands import SMOKE
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
@@ -196,8 +197,8 @@ def test_a_stock_script_learns_mazes(
 def test_methods_of_ones_own_run_from_the_command_line(
     method: str, example: Load, train: Callable[..., int]
 ) -> None:
-    given = ["--config-dir", str(EXAMPLES / "conf"), f"+method={method}", "+scale=smoke"]
-    assert train(*given, "compute.progress=false", "hydra.run.dir=run") == 0
+    given = ["--config-dir", str(EXAMPLES / "conf"), f"+method={method}", *SMOKE]
+    assert train(*given, "hydra.run.dir=run") == 0
     rows = read_csv(Path("run/metrics.csv"))
     assert [row["updates"] for row in rows] == [0, 2, 4, 6]
 

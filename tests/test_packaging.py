@@ -108,6 +108,25 @@ def test_everything_runs_where_only_what_it_requires_is_installed(
     assert done == list(minimal.commands(extra, available("method")))
 
 
+# What comes with the loop that is taught, or with a logger that the tests do without.
+BROUGHT = {"stable_baselines3", "transformers", "verl", "wandb"}
+
+
+def test_whatever_it_imports_anywhere_is_required(built: Built) -> None:
+    """By itself or an extra; also in functions that no run calls."""
+    (project,) = metadata.distributions(path=[str(built.site)])
+    required = {name for extra in [*NAMED, "ray"] for name in minimal.closure(project, extra)}
+    _, owners = minimal.installed()
+    known = {"proposer_rl", *sys.stdlib_module_names, *BROUGHT}
+    known |= {top.removesuffix(".py") for top in owners if owners[top] & required}
+    for file in (ROOT / "proposer_rl").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and not node.level:
+                names = [str(node.module)]
+            assert {name.partition(".")[0] for name in names} <= known, file
+
+
 def test_every_method_task_and_command_is_called() -> None:
     called = [words for extra in NAMED for words in minimal.commands(extra, available("method"))]
     words = {word for command in called for word in command}

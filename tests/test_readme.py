@@ -11,7 +11,7 @@ import pytest
 from proposer_rl.cli.report import main as report
 from proposer_rl.cli.train import main as train
 from proposer_rl.cli.watch import main as watch
-from tests.commands import call
+from tests.commands import LITTLE, call
 from tests.tasks.gymnasium.toys import TINY
 
 ROOT = Path(__file__).parents[1]
@@ -52,7 +52,7 @@ def smallest(words: list[str]) -> list[str]:
     if any(word.startswith("task=") for word in small):  # scales are of mazes
         return [*small, *TINY]
     scaled = any(word.startswith("+scale=") for word in small)
-    return [*small, *([] if scaled else ["+scale=smoke"]), "compute.progress=false"]
+    return [*small, *([] if scaled else ["+scale=smoke"]), "compute.progress=false", *LITTLE]
 
 
 def run(text: str) -> None:

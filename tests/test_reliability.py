@@ -13,11 +13,12 @@ import pytest
 
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.process import locked
+from tests.commands import SMOKE
 from tests.processes import Ended, Processes
 from tests.same_run import assert_same_run
 
-SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.updates=4"]
-TRAIN = ["+method=target", *SMOKE]
+FEW = [*SMOKE, "schedule.updates=4"]
+TRAIN = ["+method=target", *FEW]
 ROW = "fsync metrics.csv"
 
 
@@ -75,7 +76,7 @@ def test_a_signal_saves_and_ends_and_the_same_command_goes_on(
 def test_a_signal_in_the_proposers_episode_ends_it_and_it_is_played_again(
     processes: Processes, tmp_path: Path
 ) -> None:
-    command = ["+method=perf_gain", *SMOKE]
+    command = ["+method=perf_gain", *FEW]
     whole = processes(*command, f"hydra.run.dir={tmp_path / 'whole'}")
     # While the first row is written; what follows is the first episode. One is of 3 updates, the
     # other is so long that nobody waits for its end.

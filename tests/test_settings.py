@@ -19,6 +19,7 @@ from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes.maze_settings import MazeSettings
+from tests.commands import LITTLE
 from tests.tiny import composed
 
 ABLATIONS = sorted(file.stem for file in (CONFIG_FOLDER / "ablation").glob("*.yaml"))
@@ -39,7 +40,7 @@ def test_the_papers_values_are_the_defaults_of_the_code() -> None:
 @cache
 def first_cycle(*overrides: str) -> str:
     """The numbers of a first cycle: what is written of it, what came of Solver and Proposer."""
-    config = composed("+method=perf_gain", "+scale=smoke", "compute.progress=false", *overrides)
+    config = composed("+method=perf_gain", "+scale=smoke", *LITTLE, *overrides)
     task, learner, curriculum = parts(config, StopSignals())
     student = TaskStudent(task, learner)
     assert isinstance(curriculum, ProposerCurriculum) and curriculum.trainer is not None

@@ -18,9 +18,9 @@ from proposer_rl.experiment import Experiment
 from proposer_rl.recipes import CONFIG_FOLDER, available, file_content
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.runs.process import Interrupted, locked
-from tests.commands import call
+from tests.commands import SMOKE, call
 
-SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.updates=2"]
+FEW = [*SMOKE, "schedule.updates=2"]
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def measured(folder: Path, seed: int) -> dict[str, object]:
 
 
 def test_seeds_side_by_side_give_what_they_give_alone(train) -> None:
-    command = ["+method=hand_designed", *SMOKE, "hand_designed.until=[1]"]
+    command = ["+method=hand_designed", *FEW, "hand_designed.until=[1]"]
     assert train(*command, "seeds=[2,0]", "hydra.run.dir=together") == 0
     for seed in (2, 0):
         assert train(*command, f"seed={seed}", f"hydra.run.dir={seed}") == 0
@@ -72,7 +72,7 @@ def test_seeds_side_by_side_give_what_they_give_alone(train) -> None:
     ],
 )
 def test_wrong_seeds_get_one_line(arguments, message: str, train, capsys) -> None:
-    assert train(*arguments, *SMOKE) == 2
+    assert train(*arguments, *FEW) == 2
     assert message in capsys.readouterr().err
 
 
@@ -84,7 +84,7 @@ def states(folder: Path) -> dict[str, float]:
 def test_a_sweep_skips_what_is_finished_and_goes_on_where_it_broke(
     train, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
-    sweep = ["-m", "+method=target,hand_designed", "seed=0,1", *SMOKE, "hydra.sweep.dir=all"]
+    sweep = ["-m", "+method=target,hand_designed", "seed=0,1", *FEW, "hydra.sweep.dir=all"]
     sweep.append("schedule.updates=4")
     updates = []
     original = Experiment._update
@@ -114,7 +114,7 @@ def test_a_sweep_skips_what_is_finished_and_goes_on_where_it_broke(
 def test_a_failed_run_is_listed_and_tried_again(
     train, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
-    sweep = ["-m", "+method=target", "seed=0,1", *SMOKE, "hydra.sweep.dir=all"]
+    sweep = ["-m", "+method=target", "seed=0,1", *FEW, "hydra.sweep.dir=all"]
     original = Experiment.run
 
     def failing(self: Experiment):
@@ -129,7 +129,7 @@ def test_a_failed_run_is_listed_and_tried_again(
     assert "failed: 0_target_seed_0: the disk is on fire" in printed.out
     assert "2 runs: 1 finished, 1 failed" in printed.out
     assert "Traceback" in printed.err and "error: the disk is on fire" in printed.err
-    assert train("-m", "+method=hand_designed", "seed=0,1", *SMOKE, "hydra.sweep.dir=all") == 0
+    assert train("-m", "+method=hand_designed", "seed=0,1", *FEW, "hydra.sweep.dir=all") == 0
     assert "4 runs: 3 finished, 1 failed" in capsys.readouterr().out  # not in the second sweep
     assert train(*sweep) == 0
     assert "4 runs: 4 finished" in capsys.readouterr().out
@@ -137,7 +137,7 @@ def test_a_failed_run_is_listed_and_tried_again(
 
 
 def test_a_run_that_another_process_works_on_has_not_failed(train, capsys) -> None:
-    sweep = ["-m", "+method=target", "seed=0,1", *SMOKE, "hydra.sweep.dir=all"]
+    sweep = ["-m", "+method=target", "seed=0,1", *FEW, "hydra.sweep.dir=all"]
     taken = Path("all", "1_target_seed_1")
     taken.mkdir(parents=True)
     with locked(taken):
@@ -159,7 +159,7 @@ def test_a_run_that_another_process_works_on_has_not_failed(train, capsys) -> No
     ids=["joblib", "submitit"],
 )
 def test_other_launchers_run_a_sweep(launcher: list[str], train, capfd) -> None:
-    arguments = ["-m", "+method=target", *launcher, *SMOKE, "hydra.sweep.dir=all"]
+    arguments = ["-m", "+method=target", *launcher, *FEW, "hydra.sweep.dir=all"]
     assert train(*arguments) == 2
     assert len(states(Path("all"))) == 1
     assert "2 runs: 1 finished, 1 failed" in capfd.readouterr().out
@@ -177,7 +177,7 @@ def test_a_job_that_is_stopped_is_interrupted_and_its_sweep_says_so(
         return original(self)
 
     original = Experiment.run
-    arguments = ["-m", "+method=target", "seed=0,1", *SMOKE, "hydra.sweep.dir=all"]
+    arguments = ["-m", "+method=target", "seed=0,1", *FEW, "hydra.sweep.dir=all"]
     monkeypatch.setenv("SUBMITIT_EXECUTOR", "slurm")
     with monkeypatch.context() as patched:
         patched.setattr(Experiment, "run", stopped)
@@ -195,7 +195,7 @@ def test_a_job_that_leaves_no_result_is_told_in_a_line(
         raise UncompletedJobError("Job 7 has not produced any output\n(state: CANCELLED)")
 
     monkeypatch.setattr("hydra._internal.hydra.Hydra.multirun", lost)
-    assert train("-m", "+method=target", "seed=0,1", *SMOKE, "hydra.sweep.dir=all") == 6
+    assert train("-m", "+method=target", "seed=0,1", *FEW, "hydra.sweep.dir=all") == 6
     line = "error: no job was sent, or it left no result: Job 7 has not produced any output (state"
     assert capsys.readouterr().err.startswith(line)
 

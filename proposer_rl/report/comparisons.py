@@ -107,10 +107,11 @@ def difference(outcome: Outcome, one: Group, other: Group) -> Estimate:
     Runs of the same seed begin with the same weights and draw the same numbers: where both groups
     have the same seeds, they are compared in pairs.
     """
-    return _difference(outcome.known(one), outcome.known(other))
+    return difference_between(outcome.known(one), outcome.known(other))
 
 
-def _difference(one: Mapping[int, float], other: Mapping[int, float]) -> Estimate:
+def difference_between(one: Mapping[int, float], other: Mapping[int, float]) -> Estimate:
+    """Returns how two groups differ, from the values of their runs by seed."""
     paired = list(one) == list(other)
     return statistics.difference_of([*one.values()], [*other.values()], paired)
 
@@ -138,7 +139,7 @@ def decisions(study: Study, outcome: Outcome | None = None) -> dict[tuple[str, s
     outcome = outcome or primary(study)
     known = {group.label: outcome.known(group) for group in study.compared}
     pairs = list(combinations(study.compared, 2))
-    found = [_difference(known[one.label], known[other.label]) for one, other in pairs]
+    found = [difference_between(known[one.label], known[other.label]) for one, other in pairs]
     corrected = statistics.holm([one.p for one in found])
     count = sum(not math.isnan(p) for p in corrected)
     decided = {}

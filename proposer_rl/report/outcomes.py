@@ -16,6 +16,7 @@ from proposer_rl.report.comparisons import (
     at_the_end,
     decisions,
     difference,
+    difference_between,
     outcomes,
     primary,
 )
@@ -44,17 +45,19 @@ def comparison_table(study: Study) -> Table:
     decided = decisions(study)
     rows: list[dict[str, Cell]] = []
     for number, outcome in enumerate(outcomes(study)):
+        known = {group.label: outcome.known(group) for group in study.compared}
         for one, other in combinations(study.compared, 2):
-            values = [outcome.sign * np.asarray(outcome.values(each)) for each in (one, other)]
-            if not all(map(len, values)):
+            runs = [known[each.label] for each in (one, other)]
+            if not all(runs):
                 continue
+            values = [outcome.sign * np.array([*each.values()]) for each in runs]
             decision = decided[one.label, other.label] if number == 0 else None
             rows.append(
                 {
                     "outcome": outcome.name,
                     "first": one.label,
                     "second": other.label,
-                    "difference": difference(outcome, one, other).interval(),
+                    "difference": difference_between(*runs).interval(),
                     "verdict": decision and decision.verdict,
                     "p (Holm)": decision and decision.p,
                     "P(first better)": probability_of_improvement(*values),

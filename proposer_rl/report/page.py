@@ -9,6 +9,7 @@ import io
 import json
 import shlex
 from collections.abc import Iterable, Sequence
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -34,8 +35,6 @@ Section = dict[str, Any]  # all that the page shows of a study, as the template 
 
 def render(**content: Any) -> str:
     """Returns the page as HTML; whatever comes from a run is escaped or packed."""
-    from plotly.offline import get_plotlyjs  # what only draws figures needs no charts
-
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
@@ -43,14 +42,23 @@ def render(**content: Any) -> str:
         files(__package__).joinpath(name).read_text(encoding="utf-8")
         for name in ("page.html.j2", "page.js")
     )
-    library = get_plotlyjs()
+    library, packed = _library()
     return environment.from_string(source).render(
         content,
         script=script,
-        library=pack(library),
+        library=packed,
         # Nothing else is run, whatever may have got into the page.
         allowed=" ".join(f"'{_digest(text)}'" for text in (script, library)),
     )
+
+
+@cache
+def _library() -> tuple[str, str]:
+    """Returns the library that draws the charts, as it is and packed; packing takes half a second."""
+    from plotly.offline import get_plotlyjs  # what only draws figures needs no charts
+
+    library = get_plotlyjs()
+    return library, pack(library)
 
 
 def pack(text: str) -> str:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from proposer_rl.report.runs import COST, LARGEST_FILE, NAMES, STUDY, Run
 from proposer_rl.runs.folder import FAILURE, is_rate, read_bounded, read_csv, read_jsonl
@@ -183,12 +184,20 @@ def _by_run(folder: Path, name: str) -> dict[str, pd.DataFrame]:
 
 
 def _level_results(levels: pd.DataFrame) -> list[LevelResults]:
+    if not len(levels):
+        return []
     place = ["seed", "updates", "distribution"]
+    values = levels.drop(columns=[*place, "level"]).astype(float)
+    numbers = {name: values[name].to_numpy() for name in values}
+    rows: dict[tuple[str, ...], list[int]] = {}
+    for row, key in enumerate(zip(*(levels[name].tolist() for name in place), strict=True)):
+        rows.setdefault(key, []).append(row)
     found = []
-    for (seed, updates, name), own in levels.groupby(place, sort=False) if len(levels) else ():
-        values = own.drop(columns=[*place, "level"]).dropna(axis=1).astype(float).to_dict("list")
+    for (seed, updates, name), own in rows.items():
+        known = {kind: column[own] for kind, column in numbers.items()}
         about = {"seed": int(seed), "updates": int(updates), "distribution": name}
-        found.append(checked(LevelResults, {**about, **values}, "levels.csv.xz"))
+        about |= {kind: some.tolist() for kind, some in known.items() if not np.isnan(some).any()}
+        found.append(checked(LevelResults, about, "levels.csv.xz"))
     return found
 
 
@@ -278,7 +287,7 @@ def _levels(rows: Sequence[LevelResults], seed: int, updates: int) -> dict[str, 
             for kind, values in (("success", row.success), ("return", row.returns)):
                 if values is not None:
                     name = f"{row.distribution}_{kind}"
-                    found[name] = _rounded(name, np.array(values, float))
+                    found[name] = _rounded(is_rate(name), np.array(values, float))
     return found
 
 
@@ -288,28 +297,27 @@ def _last_sheets(cycles: Sequence[Record], sheets: Sequence[Any], seed: int) -> 
     return own[-1] if own else {}
 
 
-def _rounded(name: str, values: Column) -> Column:
+def _rounded(rate: bool | NDArray[np.bool_], values: Column) -> Column:
     """Returns values [n]; those of a rate are moved into 0 to 1 where rounding put them outside."""
     inside = values.clip(0, 1)
-    return np.where(is_rate(name) & (np.abs(values - inside) < ROUNDING), inside, values)
+    return np.where(rate & (np.abs(values - inside) < ROUNDING), inside, values)
 
 
 def _of_seed(table: pd.DataFrame, seed: int) -> pd.DataFrame:
     if not len(table):
         return table
-    own, found = table["seed"].to_numpy() == seed, {}
-    for name in table.columns.drop("seed"):
-        values = table[name].to_numpy(float)[own]
-        known = np.where(np.abs(values) < LARGEST, values, np.nan)
-        found[checked(Name, name, "the name of a column")] = _rounded(name, known)
-    return pd.DataFrame(found)
+    names = [checked(Name, name, "the name of a column") for name in table.columns.drop("seed")]
+    values = table[names].to_numpy(float)[table["seed"].to_numpy() == seed]
+    known = np.where(np.abs(values) < LARGEST, values, np.nan)
+    return pd.DataFrame(_rounded(np.array([*map(is_rate, names)], bool), known), columns=names)
 
 
 def _check_metrics(run: Run) -> None:
+    unknown = run.metrics.isna().any()
     for name in sorted({*COST, *run.measurements, run.headline}):
-        if name not in run.metrics:
+        if name not in unknown:
             raise ValueError(f"metrics.csv has no column {name!r}")
-        if run.metrics[name].isna().any():
+        if unknown[name]:
             raise ValueError(f"metrics.csv: {name} is not always a number")
-    if (run.metrics["updates"].diff() <= 0).any():
+    if (np.diff(run.metrics["updates"]) <= 0).any():
         raise ValueError("metrics.csv: updates do not grow from row to row")

@@ -119,12 +119,17 @@ IN_ORDER = [(0, slice(None)), (1, slice(None))]
 OTHERWISE = [(1, slice(None)), (0, slice(1, None, 2)), (0, slice(0, None, 2))]
 
 
+OUTCOMES: dict[str, list[TensorDict]] = {}
+
+
 def two_outstanding(name: str, returns: Sequence[Return]) -> tuple[Any, Any, Any]:
     """Of two batches that come back somehow: what is logged, proposed next, and the state then."""
     curriculum, learner = resumed(name)
     student = TaskStudent(TASK, learner)
     batches = [curriculum.propose(student, n, [Streams(0, "two", n)]) for n in (P, P + 1)]
-    outcomes = [played(student, batch, n) for n, batch in enumerate(batches)]
+    if name not in OUTCOMES:  # of the same batches whatever comes back of them, and when
+        OUTCOMES[name] = [played(student, batch, n) for n, batch in enumerate(batches)]
+    outcomes = OUTCOMES[name]
     for number, part in returns:
         curriculum.observe(student, batches[number][:, part], outcomes[number][:, part])
     logged = curriculum.log()
@@ -218,16 +223,15 @@ WRONG: dict[str, tuple[Callable[[Batch, TensorDict], tuple[Batch, TensorDictBase
     "name",
     ["plr", "progress of episodes", "alp_gmm", "adaptive_mixture", "paired", "filter on a model"],
 )
-@pytest.mark.parametrize("wrong", WRONG)
-def test_what_does_not_fit_is_refused_and_counts_nothing(name: str, wrong: str) -> None:
+def test_what_does_not_fit_is_refused_and_counts_nothing(name: str) -> None:
     curriculum, student = EVERY[name](), TaskStudent(TASK, solvers([0]))
     batch = curriculum.propose(student, P, [Streams(0)])
     outcome = played(student, batch, 0)
     before = curriculum.state_dict()
-    change, message = WRONG[wrong]
-    with pytest.raises(ValueError, match=message):
-        curriculum.observe(student, *change(batch, outcome))
-    assert same(before, curriculum.state_dict())
+    for change, message in WRONG.values():
+        with pytest.raises(ValueError, match=message):
+            curriculum.observe(student, *change(batch, outcome))
+        assert same(before, curriculum.state_dict())
     curriculum.observe(student, batch, outcome)
 
 

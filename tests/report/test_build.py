@@ -22,7 +22,6 @@ from proposer_rl.report import build
 from proposer_rl.report.build import write_report
 from proposer_rl.report.figures import (
     along_training,
-    cost_curves,
     draw_run,
     learning_curves,
     side_by_side,
@@ -138,7 +137,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_the_same_runs_give_the_same_files(
     runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(build, "DRAWINGS", [cost_curves, along_training])
+    monkeypatch.setattr(build, "DRAWINGS", [along_training])
     for name in ("one", "two"):
         main([str(runs), "-q", "-o", str(tmp_path / name)])
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
@@ -147,7 +146,7 @@ def test_the_same_runs_give_the_same_files(
 def test_a_report_is_replaced_and_nothing_else(
     runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(build, "DRAWINGS", [cost_curves])
+    monkeypatch.setattr(build, "DRAWINGS", [along_training])
     output = tmp_path / "report"
     main([str(runs), "-q", "-o", str(output)])
     (output / "figures" / "old.png").write_bytes(b"of a former report")
@@ -219,10 +218,8 @@ def test_the_tables_of_a_report_are_known_as_one(runs: Path, tmp_path: Path) -> 
     assert (tmp_path / "kept" / "tables" / "runs.csv").read_text() != "old"
 
 
-def test_the_baseline_can_be_chosen_among_the_methods(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(build, "DRAWINGS", [cost_curves])  # tables tell it
+@pytest.mark.usefixtures("undrawn")
+def test_the_baseline_can_be_chosen_among_the_methods(tmp_path: Path) -> None:
     for method in ("target", "plr"):
         for seed in range(5):
             write_run(tmp_path / "runs" / f"{method}{seed}", method, [seed], [0, 0.1 * seed + 0.3])

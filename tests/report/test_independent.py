@@ -157,7 +157,12 @@ def test_of_runs_with_every_kind_of_seed(tmp_path: Path) -> None:
     check(metrics, *tables, rel=1e-5)
 
 
-LARGE = ("curricula", "medium")
+LARGE = (
+    "arena",
+    "curricula",
+    "medium",
+    "no_oracle",
+)  # the others and the runs above protect the same
 
 
 @pytest.mark.parametrize(
