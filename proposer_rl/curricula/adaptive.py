@@ -37,7 +37,7 @@ from typing import Annotated, Any
 
 import torch
 from annotated_types import Ge
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -70,7 +70,8 @@ ITEMS_LEARNABLE, ITEMS_TIMES = 1.0, 4  # that, and times as many candidates, of 
 NEAR = 0.025  # standard deviation of what is added between two levels, in shares of a range
 # Levels of the way that are assigned to draws of the target together. The time of an assignment
 # grows faster than with the square: of 288, it is 10 ms in blocks of 64, 30 of 128, 150 at once.
-AT_ONCE = 64
+# Blocks of more than MANY are half as large, which takes a third of the time.
+AT_ONCE, MANY = 64, 512
 FORBIDDEN = 1e3  # cost of a candidate that is not mastered
 FAILURES = 4.0  # on the target, that are taken for seen at the beginning
 LOGGED = 100  # batches at most, whose predictions a log is about
@@ -208,10 +209,9 @@ class AdaptiveMixture(Curriculum):
 
     def _take_in(self) -> None:
         """Learns from the outcomes since the last proposal."""
-        for seen in self._inbox.take():
+        for seen, batches in together(self._inbox.take()):
             returns = seen["return"]
             success, labels = self._labels(returns, seen.get("success", None))
-            batches = labels.shape[1] / max(int(seen["size"][0, 0]), FEW)  # that have passed
             which, counts = (_each(seen.get(n, None), len(labels)) for n in ("items", "counts"))
             every = zip(self._beliefs, seen["inputs"], labels, which, counts, strict=True)
             for belief, x, label, own, count in every:
@@ -237,8 +237,9 @@ class AdaptiveMixture(Curriculum):
     def _labels(self, returns: Tensor, success: Tensor | None) -> tuple[Tensor, Tensor]:
         """Returns what counts as success on levels, and what the belief learns, float64 [K, m]."""
         self._number += returns.shape[1]
-        ends = torch.cat([self._ends, torch.stack([returns, -returns])], -1).sort(-1).values
-        self._ends = ends[..., : MOST_OUTLIERS + 1]
+        ends = torch.cat([self._ends, torch.stack([returns, -returns])], -1)
+        kept = min(MOST_OUTLIERS + 1, ends.shape[-1])
+        self._ends = ends = ends.topk(kept, largest=False).values
         place = min(self._number // OUTLIERS, MOST_OUTLIERS)
         low, high = ends[0, :, place, None], -ends[1, :, place, None]
         wide = high - low > EQUAL * torch.maximum(high.abs(), low.abs())
@@ -312,12 +313,18 @@ class AdaptiveMixture(Curriculum):
         allowed = p >= p.topk(count).values[-1].clamp(max=self._delta)
         bonus = ITEMS_LEARNABLE if self._is_data else LEARNABLE
         extra = torch.where(allowed, -bonus * 4 * p * (1 - p), FORBIDDEN)
+        most, start = AT_ONCE if count <= MANY else AT_ONCE // 2, 0
         chosen = []
-        for start in range(0, count, AT_ONCE):
-            end = min(start + AT_ONCE, count)
-            few = slice(times * start, times * end)
-            far = torch.cdist(goals[start:end], x[few]).square() / max(x.shape[1], 1)
-            chosen.append(few.start + assigned(far + extra[few]))
+        while start < count:
+            size = min(most, count - start)
+            number = min(MANY, count - start) // size  # of blocks whose costs are taken together
+            few = slice(times * start, times * (start + number * size))
+            every = x[few].view(number, times * size, x.shape[1])
+            some = goals[start : start + number * size].view(number, size, x.shape[1])
+            far = torch.cdist(some, every).square_().div_(max(x.shape[1], 1))
+            for costs in far.add_(extra[few].view(number, 1, -1)):
+                chosen.append(times * start + assigned(costs))
+                start += size
         self._last[str(k)] = levels[torch.cat(chosen)]
         return self._last[str(k)]
 
@@ -353,6 +360,24 @@ class AdaptiveMixture(Curriculum):
 
 def _each(items: Tensor | None, students: int) -> Sequence[Tensor | None]:
     return [None] * students if items is None else list(items)
+
+
+def together(parts: Sequence[TensorDict]) -> list[tuple[TensorDict, float]]:
+    """Returns parts of batches [K, m] as they are learned from, and the batches that pass by each.
+
+    Parts of more than MANY levels are joined, with others of one kind, up to a batch.
+    """
+    joined: list[tuple[TensorDict, float]] = []
+    for part in parts:
+        size = int(part["size"][0, 0])
+        share = part.shape[1] / max(size, FEW)
+        if size > MANY and joined:
+            last, passed = joined[-1]
+            if passed + share <= 1 and last.keys() == part.keys():
+                part, share = torch.cat([last, part], 1), passed + share
+                joined.pop()
+        joined.append((part, share))
+    return joined
 
 
 def some_of_each(levels: Levels, arms: Tensor) -> dict[str, Levels]:

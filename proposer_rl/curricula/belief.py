@@ -59,6 +59,7 @@ STEADY = 256.0  # items that the variance is the mean of
 WIDEST = 24  # inputs; more are projected to as many
 STEPS, CLOSE = 12, 1e-4  # of Newton's method, and the change of log odds at which it ends
 LEAP = 3.0  # of log odds in one of its steps, at most
+AT_ONCE = 1024  # levels that are predicted together: what fits a cache takes a third of the time
 SURE = 1e-3  # least curvature that an episode adds, p (1 - p)
 REMEMBERED = "mean", "precision", "own", "seen", "apart"
 
@@ -188,8 +189,12 @@ class Belief:
         """
         if self._covariance is None:
             self._covariance = torch.linalg.inv(self._precision)
-        phi = self._columns(inputs)
-        z, variance = phi @ self._mean, ((phi @ self._covariance) * phi).sum(-1)
+        z, variance = inputs.new_empty(2, len(inputs))
+        for start in range(0, len(inputs), AT_ONCE):
+            some = slice(start, start + AT_ONCE)
+            phi = self._columns(inputs[some])
+            z[some] = phi @ self._mean
+            variance[some] = (phi @ self._covariance).mul_(phi).sum(-1)
         if items is not None:
             z, variance = z + self._own[items], variance + self._doubt(items)
         return (z / (1 + math.pi / 8 * variance).sqrt()).sigmoid()
@@ -228,9 +233,14 @@ class Belief:
     def _columns(self, inputs: Tensor) -> Tensor:
         """Returns the columns of inputs [n, D]: [n, F]."""
         x = inputs if self._project is None else inputs @ self._project
-        waves = self._height * (x @ self._frequencies + self._phases).cos()
-        one = torch.ones_like(waves[..., :1])
-        return torch.cat([one, torch.zeros_like(one), x, x.square(), waves], -1)
+        size = x.shape[1]
+        phi = x.new_empty(len(x), len(self._mean))
+        phi[:, 0], phi[:, 1] = 1, 0
+        phi[:, 2 : 2 + size] = x
+        torch.square(x, out=phi[:, 2 + size : 2 + 2 * size])
+        waves = (x @ self._frequencies).add_(self._phases).cos_()
+        torch.mul(waves, self._height, out=phi[:, 2 + 2 * size :])
+        return phi
 
 
 def _bend(p: Tensor) -> Tensor:

@@ -150,8 +150,8 @@ class BoundsCurriculum(Curriculum):
         """Moves the bounds by what has come in, in the order of the proposals."""
         for evidence in self._inbox.take():
             for k, own in enumerate(evidence.unbind(0)):
-                some = own[own["bound"] != INSIDE]
-                columns = (some[name].tolist() for name in ("bound", "at", "reached"))
+                on_bound = own["bound"] != INSIDE
+                columns = (own[name][on_bound].tolist() for name in ("bound", "at", "reached"))
                 # Thousands at once: tensors would take a hundred times as long, number by number.
                 bounds, sums, played = (
                     known[k].flatten().tolist() for known in (self.bounds, self._sums, self._played)

@@ -113,25 +113,24 @@ class Ledger:
         Raises:
             ArgumentError: for one that is not out, or stands there twice.
         """
-        starts = np.array([block.start for block in self.blocks])
-        number = starts.searchsorted(ids, "right") - 1
+        number = np.searchsorted([block.start for block in self.blocks], ids, "right")
         parts = []
-        for each in np.unique(number).tolist():
+        for each in np.flatnonzero(np.bincount(number)).tolist():
             which = np.flatnonzero(number == each)
-            if each < 0:
+            if not each:
                 self._refuse(int(ids[which[0]]), OVER)
-            block = self.blocks[each]
+            block = self.blocks[each - 1]
             place = ids[which] - block.start
-            # What is between blocks is over.
-            states = np.append(block.state[0], OVER).take(place, mode="clip")
+            states = block.state[0].take(place, mode="clip")
+            states[place >= block.end - block.start] = OVER  # what is between blocks is over
             wrong = np.flatnonzero(states != OUT)
             if len(wrong):
                 self._refuse(int(ids[which[wrong[0]]]), states[wrong[0]])
             parts.append(Found(block, which, place))
-        if len(ids) > 1 and (np.diff(ids) <= 0).any():  # else they rise
-            once, counts = np.unique(ids, return_counts=True)
-            if (counts > 1).any():
-                raise ArgumentError(f"ids={once[counts > 1][0]}: is there more than once")
+        rising = np.sort(ids)
+        twice = rising[1:][rising[1:] == rising[:-1]]
+        if len(twice):
+            raise ArgumentError(f"ids={twice[0]}: is there more than once")
         return parts
 
     def hand_out(self, id: int, student: int) -> Levels:

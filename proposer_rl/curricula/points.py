@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
@@ -57,7 +58,14 @@ class Points:
                 stacklevel=2,
             )
         self._space, self._rounded = space, rounded
-        self.size: int = space.coordinates.shape[1]
+        places = space.coordinates.double()
+        self.size: int = places.shape[1]
+        # Of a grid, in the order of its bins, the places along each axis; of others None.
+        self._lines: list[Tensor] | None = None
+        lines = [line.unique() for line in places.mT]
+        if math.prod(map(len, lines)) == len(places):
+            grid = torch.cartesian_prod(*lines).reshape(places.shape)
+            self._lines = [line.unsqueeze(-1) for line in lines] if grid.equal(places) else None
 
     @property
     def free(self) -> Tensor:
@@ -68,11 +76,19 @@ class Points:
 
     def levels(self, points: Tensor, streams: Sequence[Streams]) -> tuple[Levels, Tensor]:
         """Returns the levels [K, n] at points float64 [K, n, D], and their bins, int64 [K, n]."""
-        places = self._space.coordinates.double()
-        bins = nearest(points.flatten(0, 1), places).view(points.shape[:2])
+        bins = self._nearest(points.flatten(0, 1)).view(points.shape[:2])
         draws = [s.generator("levels") for s in streams]
         space: Any = self._space  # only one of continuous parameters has a method `at`
         return space.generate(bins, draws) if self._rounded else space.at(points, draws), bins
+
+    def _nearest(self, points: Tensor) -> Tensor:
+        """Returns the bins nearest to points float64 [m, D], int64 [m]."""
+        if self._lines is None:
+            return nearest(points, self._space.coordinates.double())
+        bins = torch.zeros(len(points), dtype=torch.int64)
+        for line, along in zip(self._lines, points.split(1, -1), strict=True):
+            bins = bins * len(line) + nearest(along, line)
+        return bins
 
     def tasks(self, points: Tensor, bins: Tensor) -> Tensor:
         """Returns where the levels at points float64 [K, n, D] lie, float64 [K, n, D]."""

@@ -54,7 +54,7 @@ def render(**content: Any) -> str:
 
 @cache
 def _library() -> tuple[str, str]:
-    """Returns the library that draws the charts, as it is and packed; packing takes half a second."""
+    """Returns the library of the charts, as it is and packed, which takes half a second."""
     from plotly.offline import get_plotlyjs  # what only draws figures needs no charts
 
     library = get_plotlyjs()

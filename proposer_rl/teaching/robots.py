@@ -86,12 +86,15 @@ class LevelTerm:
         if len(once) < len(ids):
             raise ArgumentError(f"env_ids={int(once[counts > 1][0])}: is there more than once")
         tickets = self.tickets[ids]
-        counts_for = (tickets != NONE) & (env.episode_length_buf[ids] > 0)
+        known = tickets != NONE
+        counts_for = known & (env.episode_length_buf[ids] > 0)
         if counts_for.any():
             counts_for &= env.reset_buf[ids].bool()
             if counts_for.any():
                 self.teacher.tell(tickets[counts_for], *self.results(ids[counts_for]))
-        self.teacher.drop(tickets[(tickets != NONE) & ~counts_for])
+        cut_off = tickets[known & ~counts_for]
+        if len(cut_off):
+            self.teacher.drop(cut_off)
         asked, levels = self.teacher.ask(len(ids))
         self.tickets[ids], levels = asked.to(env.device), levels.to(env.device)
         if self._levels is None:

@@ -276,15 +276,16 @@ class Teacher:
                 resumed loop begins anew.
         """
         with self._here():
-            before = self._ledger.out
             if ids is None:
+                dropped = self._ledger.out
                 self._ledger.drop_all()
                 self._whole.clear()
             else:
                 tickets = as_ids(ids)
-                going = self._ledger.states(tickets) != OVER
-                self._ledger.drop(self._ledger.find(tickets[going]))
-            self._tally.dropped(before - self._ledger.out)
+                going = tickets[self._ledger.states(tickets) != OVER]
+                self._ledger.drop(self._ledger.find(going))
+                dropped = len(going)
+            self._tally.dropped(dropped)
 
     @own_state()
     def observe(self, outcome: Any, ids: Any = None) -> None:
