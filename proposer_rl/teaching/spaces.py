@@ -123,8 +123,8 @@ class LevelSpace:
 class Parameters(LevelSpace, ParameterSpace):
     """Levels that are values of named parameters.
 
-    In batches a level is a tensordict with an entry for each parameter, float64 or int64, of choices
-    that are not all numbers the place in their list. One by one it is a dict of numbers and texts.
+    In batches a level is a tensordict with an entry for each parameter, float64 or int64: of other
+    choices than numbers the place in their list. One by one it is a dict of numbers and texts.
 
     Args:
         ranges: of each parameter, by name: ``(low, high)`` for a continuous range, ``range(a, b)``
