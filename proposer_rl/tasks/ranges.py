@@ -196,7 +196,9 @@ def read_part(key: str, given: Any, line: Bins) -> Bins:
         raise ArgumentError(f"{key}={shown(given)}: must be a number, (from, to) or a list of them")
     part = read_line(key, many)
     if not line.low.is_floating_point() and part.low.is_floating_point():
-        raise ArgumentError(f"{key}={given}: must be whole, as the range is")
+        raise ArgumentError(
+            f"{key}={given}: must be whole, as the range is: one, a list or range(from, to + 1)"
+        )
     part = Bins(part.low.to(line.low), part.high.to(line.high))
     if not line.wide and (part.wide or not torch.isin(part.low, line.low).all()):
         raise ArgumentError(f"{key}={given}: must be among {line.low.tolist()}")

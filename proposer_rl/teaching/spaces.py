@@ -123,8 +123,8 @@ class LevelSpace:
 class Parameters(LevelSpace, ParameterSpace):
     """Levels that are values of named parameters.
 
-    In batches a level is a tensordict with an entry for each parameter, float64 or int64, of texts
-    the place in their list. One by one it is a dict of numbers and texts.
+    In batches a level is a tensordict with an entry for each parameter, float64 or int64: of other
+    choices than numbers the place in their list. One by one it is a dict of numbers and texts.
 
     Args:
         ranges: of each parameter, by name: ``(low, high)`` for a continuous range, ``range(a, b)``
@@ -195,6 +195,8 @@ class Parameters(LevelSpace, ParameterSpace):
                 "bins=1, which suffices for curricula that need none"
             ) from error
         self.labels = {name: getattr(part, "labels", None) for name, part in parts.items()}
+        for name, labels in self.labels.items():
+            _warn_of_places(f"ranges.{name}", labels or [])
         if in_file:
             _check_names("target", target or {}, parts)
             read = {name: target_in_file(one, parts[name]) for name, one in in_file.items()}
@@ -565,6 +567,18 @@ def _warn_of_two(key: str, values: Any) -> None:
             f"range from {low} to {high} is a tuple, ({low}, {high})",
             stacklevel=4,
         )
+
+
+def _warn_of_places(key: str, labels: Sequence[Any]) -> None:
+    """Warns of choices that are numbers or truth values, but other ones than their places."""
+    for place, label in enumerate(labels):
+        if isinstance(label, int | float) and label != place:
+            warnings.warn(
+                f"{key}={shown(labels)}: in batches a level has its place in this list, {place} "
+                f"for {label}, and the value itself one by one alone",
+                stacklevel=4,
+            )
+            return
 
 
 def _check_names(key: str, given: Mapping[str, Any], known: Mapping[str, Any]) -> None:

@@ -132,7 +132,7 @@ def _distinct(part: Bins) -> list[str]:
 
 
 def _label_texts(labels: list[Any]) -> list[str]:
-    """Returns names of choices, with their places where two look alike."""
+    """Returns names of choices, with their places where two are alike."""
     texts = [*map(str, labels)]
     alike = len({*texts}) < len(texts)
     return [f"{place}: {text}" for place, text in enumerate(texts)] if alike else texts

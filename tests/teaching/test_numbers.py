@@ -219,6 +219,10 @@ def far_target() -> None:
     prl.Parameters({"g": (0.0, 1.0)}, target={"g": {"distribution": "norm", "loc": 5.0}})
 
 
+def truths_in_falling_order() -> None:
+    prl.Parameters({"on": [True, False], "off": [False, True]})
+
+
 def some_successes() -> None:
     teacher = prl.Teacher("adaptive_mixture", LINE)
     for success in (None, True, None, True):
@@ -231,6 +235,7 @@ def some_successes() -> None:
         (far_features, "features=.*: each should be about -1 to 1"),
         (far_target, "target.g: most of it, norm.*, lies outside of 0 to 1"),
         (some_successes, "success: told of some levels alone"),
+        (truths_in_falling_order, r"ranges.on=\[True, False\]: in batches .* place .* 0 for True"),
     ],
 )
 def test_what_may_be_misread_is_said_once(misread: Callable[[], None], message: str) -> None:
