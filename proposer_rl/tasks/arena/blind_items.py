@@ -35,13 +35,13 @@ class BlindItemsEnv(BatchedEnv):
     actions: ClassVar[int | None] = ANSWERS
 
     def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns the word's beginning."""
+        """Returns the initial state [*B, 1]: the place 0 in the word."""
         return torch.zeros_like(level["item"], dtype=torch.float32).unsqueeze(-1)
 
     def advance(
         self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
     ) -> Step:
-        """Returns the place of the next symbol."""
+        """Returns the step's result: the next symbol's place, and whether the answer was right."""
         right = action == _ANSWER.to(action.device)[self._symbol(state, level)]
         state = state + 1
         solved = right & (state.squeeze(-1) >= _LENGTH.to(action.device)[level["item"].long()])

@@ -37,13 +37,13 @@ class CartEnv(BatchedEnv):
     draws: ClassVar[int] = 4
 
     def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns place, speed, angle and its speed, each within a twentieth of 0."""
+        """Returns the initial place, speed, angle and angular speed [*B, 4], each within ±0.05."""
         return 0.1 * chance - 0.05
 
     def advance(
         self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
     ) -> Step:
-        """Returns where cart and pole are after a step of Euler's method."""
+        """Returns the step's result: the four numbers after a step of Euler's method."""
         place, speed, angle, turning = state.unbind(-1)
         total, moment = level["cart"] + level["pole"], level["pole"] * level["length"]
         sine, cosine = angle.sin(), angle.cos()

@@ -29,13 +29,13 @@ class CrowdEnv(BatchedEnv):
     draws: ClassVar[int] = len(LANES)
 
     def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns the lower end, and others anywhere in their lanes."""
+        """Returns the initial state: the agent below, the others anywhere in their lanes."""
         return torch.cat([torch.zeros_like(chance[..., :1]), 2 * chance - 1], -1)
 
     def advance(
         self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
     ) -> Step:
-        """Returns where everybody is after a step; the others' are of any length up to twice."""
+        """Returns the step's result: all next places, the others' after steps of random length."""
         y = state[..., 0] + level["pace"] * action
         ways = 1 - 2 * (torch.arange(len(LANES), device=y.device) % 2)
         others = _around(state[..., 1:] + ways * 2 * chance * level["speed"].unsqueeze(-1))

@@ -32,7 +32,7 @@ class DoorkeyEnv(BatchedEnv):
     draws: ClassVar[int] = 5
 
     def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns a map, whose door is locked."""
+        """Returns the initial state [*B, 9]: a map whose door is locked."""
         size, share = level["size"], chance.unbind(-1)
         rows = size - 2
         wall = 2 + (share[0] * (size - 4)).long()
@@ -48,7 +48,7 @@ class DoorkeyEnv(BatchedEnv):
     def advance(
         self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
     ) -> Step:
-        """Returns what the action does to the agent, the key and the door."""
+        """Returns the step's result: what the action does to the agent, the key and the door."""
         wall, door, how, key_x, key_y, x, y, way, steps = state.unbind(-1)
         to_x, to_y = x + _aside(way + 1), y + _aside(way)
         walls, keys, doors, goal = _things(state, level, to_x, to_y)

@@ -26,13 +26,13 @@ class FerryEnv(BatchedEnv):
     draws: ClassVar[int] = 1
 
     def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns a place on the bank, about opposite the dock."""
+        """Returns the initial state [*B, 2]: a place on the bank, about opposite the dock."""
         return torch.cat([0.4 * chance - 0.2, torch.zeros_like(chance)], -1)
 
     def advance(
         self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
     ) -> Step:
-        """Returns the next place."""
+        """Returns the step's result: the ferry's next place, and whether it has landed."""
         drift = STEER * (level["current"] + action[..., 0]) + GUST * (2 * chance[..., 0] - 1)
         aside, across = state[..., 0] + drift, state[..., 1] + 1
         over = across >= STEPS

@@ -26,13 +26,13 @@ class ForkEnv(BatchedEnv):
     actions: ClassVar[int | None] = 2
 
     def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns the middle."""
+        """Returns the initial state [*B, 1]: the cell in the middle."""
         return chance.new_zeros(*self.batch_size, 1)
 
     def advance(
         self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
     ) -> Step:
-        """Returns the next cell: action 1 leads to the right, 0 to the left."""
+        """Returns the step's result: the next cell, to the right by action 1, to the left by 0."""
         place = state.squeeze(-1) + 2 * action - 1
         right_way = torch.where(level["depth"] > DEEP, -place, place)
         end, trap = right_way >= level["length"], right_way <= -2

@@ -28,13 +28,13 @@ class GoalMazeEnv(BatchedEnv):
     draws: ClassVar[int] = 2
 
     def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns a place in the corner."""
+        """Returns the initial state [*B, 2]: a place in the corner."""
         return (BORDER - BLOCK) * chance - BORDER
 
     def advance(
         self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
     ) -> Step:
-        """Returns the next place, which walls hold up along the axis on which they were met."""
+        """Returns the step's result: the next place; a wall stops the axis on which it is met."""
         length = action.norm(dim=-1, keepdim=True).clamp(min=1)
         place = (state + STRIDE * action / length).clamp(-BORDER, BORDER)
         inside = (place.abs() < BLOCK).all(-1, keepdim=True)

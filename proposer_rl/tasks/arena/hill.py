@@ -24,14 +24,14 @@ class HillEnv(BatchedEnv):
     draws: ClassVar[int] = 1
 
     def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns a place near the bottom, at rest."""
+        """Returns the initial place near the bottom and speed 0, [*B, 2]."""
         place = -0.6 + 0.2 * chance
         return torch.cat([place, torch.zeros_like(place)], -1)
 
     def advance(
         self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
     ) -> Step:
-        """Returns the car's next place and speed."""
+        """Returns the step's result: the car's next place and speed."""
         place, speed = state.unbind(-1)
         push = (action - 1) * level["force"] - 0.0025 * (3 * place).cos()
         speed = (speed + push).clamp(-0.07, 0.07)

@@ -27,13 +27,13 @@ class IceEnv(BatchedEnv):
     draws: ClassVar[int] = 2
 
     def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns the first cell of the middle."""
+        """Returns the initial state [*B, 2]: the first cell of the middle row."""
         return torch.stack([torch.zeros_like(level["slip"]), level["width"] // 2], -1).float()
 
     def advance(
         self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
     ) -> Step:
-        """Returns the next cell."""
+        """Returns the step's result: the next cell, and whether it is a pit or the end."""
         along, across = state.unbind(-1)
         aside = torch.where(chance[..., 1] < 0.5, LEFT, RIGHT)
         move = torch.where(chance[..., 0] < level["slip"], aside, action)

@@ -27,13 +27,13 @@ class LureEnv(BatchedEnv):
     draws: ClassVar[int] = 1
 
     def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns a place near the origin."""
+        """Returns the initial state [*B, 2]: a place near the origin."""
         return torch.cat([torch.zeros_like(chance), 0.2 * chance - 0.1], -1)
 
     def advance(
         self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
     ) -> Step:
-        """Returns the next place: first along x, then along y, unless a wall is in between."""
+        """Returns the step's result: the next place, moved along x, then along y, up to walls."""
         x, y = state.unbind(-1)
         new_x, new_y = (state + STRIDE * action).unbind(-1)
         wall, half = level["distance"] / 2, level["width"] / 2

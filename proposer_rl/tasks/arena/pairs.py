@@ -29,7 +29,7 @@ class PairsEnv(ReachEnv):
     def advance(
         self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
     ) -> Step:
-        """Returns the point's next place and velocity."""
+        """Returns the step's result: the point's next place and velocity."""
         return super().advance(state, action, problem(level), chance)
 
     def observe(self, state: Tensor, level: Mapping[str, Tensor]) -> Tensor:

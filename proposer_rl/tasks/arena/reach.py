@@ -28,13 +28,13 @@ class ReachEnv(BatchedEnv):
     forces: ClassVar[int] = 2
 
     def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns the origin, at rest."""
+        """Returns the initial state [*B, 4]: the point at the origin, at rest."""
         return chance.new_zeros(*self.batch_size, 4)
 
     def advance(
         self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
     ) -> Step:
-        """Returns the point's next place and velocity."""
+        """Returns the step's result: the point's next state, and whether it is at the goal."""
         velocity = DRAG * state[..., 2:] + THRUST * action
         place = state[..., :2] + velocity
         there = (goal(level) - place).square().sum(-1) <= RADIUS**2

@@ -28,14 +28,14 @@ class RecallEnv(BatchedEnv):
     draws: ClassVar[int] = 2
 
     def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns the first cell, where the door is shown."""
+        """Returns the initial state [*B, 3]: the first cell, where the door is shown."""
         door = (DOORS * chance[..., 0]).floor()
         return torch.stack([torch.zeros_like(door), door, door], -1)
 
     def advance(
         self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
     ) -> Step:
-        """Returns the next cell, or the end behind a door."""
+        """Returns the step's result: the next cell, or the end of the episode behind a door."""
         cell, door, shown = state.unbind(-1)
         last = level["length"] - 1
         left = (cell >= last) & (action > 0)

@@ -28,14 +28,14 @@ class SwingEnv(BatchedEnv):
     draws: ClassVar[int] = 1
 
     def begin(self, level: Mapping[str, Tensor], chance: Tensor) -> Tensor:
-        """Returns a pendulum that hangs about straight down, at rest."""
+        """Returns the initial state [*B, 3]: the pendulum hangs about straight down, at rest."""
         angle = torch.pi + chance - 0.5
         return torch.cat([angle, torch.zeros_like(angle), torch.zeros_like(angle)], -1)
 
     def advance(
         self, state: Tensor, action: Tensor, level: Mapping[str, Tensor], chance: Tensor
     ) -> Step:
-        """Returns the pendulum's next angle and speed."""
+        """Returns the step's result: the pendulum's next angle and speed, and its steps upright."""
         angle, speed, held = state.unbind(-1)
         mass, length = level["mass"], level["length"]
         torque = action.squeeze(-1) * level["torque"]
