@@ -31,14 +31,14 @@ class RobotEnv(BatchedEnv):
     draws = 3
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns place, speed, height of the foot, lean and its speed: near rest."""
+        """Returns the initial state [*B, 5], near rest: place, speed, foot, lean and its speed."""
         place, lean, turning = chance.unbind(-1)
         none = torch.zeros_like(place)
         state = [0.5 * APART * place, none, none, 0.1 * lean - 0.05, 0.1 * turning - 0.05]
         return torch.stack(state, -1)
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns where the robot is after a step of Euler's method."""
+        """Returns the step's result: the robot's state after a step of Euler's method."""
         place, speed, foot, lean, turning = state.unbind(-1)
         push, lift, turn = action.unbind(-1)
         foot = (foot + 0.15 * lift).clamp(0, HIGHEST)

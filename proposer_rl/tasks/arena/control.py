@@ -34,11 +34,11 @@ class CartEnv(BatchedEnv):
     draws = 4
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns place, speed, angle and its speed, each within a twentieth of 0."""
+        """Returns the initial place, speed, angle and angular speed [*B, 4], each within ±0.05."""
         return 0.1 * chance - 0.05
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns where cart and pole are after a step of Euler's method."""
+        """Returns the step's result: the four numbers after a step of Euler's method."""
         place, speed, angle, turning = state.unbind(-1)
         total, moment = level["cart"] + level["pole"], level["pole"] * level["length"]
         sine, cosine = angle.sin(), angle.cos()
@@ -73,12 +73,12 @@ class HillEnv(BatchedEnv):
     draws = 1
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns a place near the bottom, at rest."""
+        """Returns the initial place near the bottom and speed 0, [*B, 2]."""
         place = -0.6 + 0.2 * chance
         return torch.cat([place, torch.zeros_like(place)], -1)
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns the car's next place and speed."""
+        """Returns the step's result: the car's next place and speed."""
         place, speed = state.unbind(-1)
         push = (action - 1) * level["force"] - 0.0025 * (3 * place).cos()
         speed = (speed + push).clamp(-0.07, 0.07)
@@ -111,12 +111,12 @@ class SwingEnv(BatchedEnv):
     draws = 1
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns a pendulum that hangs about straight down, at rest."""
+        """Returns the initial state [*B, 3]: the pendulum hangs about straight down, at rest."""
         angle = torch.pi + chance - 0.5
         return torch.cat([angle, torch.zeros_like(angle), torch.zeros_like(angle)], -1)
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns the pendulum's next angle and speed."""
+        """Returns the step's result: the pendulum's next angle and speed, and its steps upright."""
         angle, speed, held = state.unbind(-1)
         mass, length = level["mass"], level["length"]
         torque = action.squeeze(-1) * level["torque"]

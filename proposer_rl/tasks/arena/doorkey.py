@@ -29,7 +29,7 @@ class DoorkeyEnv(BatchedEnv):
     draws = 5
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns a map, whose door is locked."""
+        """Returns the initial state [*B, 9]: a map whose door is locked."""
         size, share = level["size"], chance.unbind(-1)
         rows = size - 2
         wall = 2 + (share[0] * (size - 4)).long()
@@ -43,7 +43,7 @@ class DoorkeyEnv(BatchedEnv):
         return torch.stack([wall, door, steps + LOCKED, *inside, way, steps], -1).float()
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns what the action does to the agent, the key and the door."""
+        """Returns the step's result: what the action does to the agent, the key and the door."""
         wall, door, how, key_x, key_y, x, y, way, steps = state.unbind(-1)
         to_x, to_y = x + _aside(way + 1), y + _aside(way)
         walls, keys, doors, goal = _things(state, level, to_x, to_y)

@@ -33,7 +33,7 @@ class BlindItemsEnv(BatchedEnv):
     actions = ANSWERS
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns the place of the next symbol."""
+        """Returns the step's result: the next symbol's place, and whether the answer was right."""
         right = action == _ANSWER.to(action.device)[self._symbol(state, level)]
         state = state + 1
         solved = right & (state.squeeze(-1) >= _LENGTH.to(action.device)[level["item"].long()])
@@ -67,7 +67,7 @@ class PairsEnv(ReachEnv):
         return torch.cat([far, goal(place) / FAR, idle], -1)
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns the point's next place and velocity."""
+        """Returns the step's result: the point's next place and velocity."""
         return super().advance(state, action, problem(level), chance)
 
     def observe(self, state: Tensor, level: Values) -> Tensor:

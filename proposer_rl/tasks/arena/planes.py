@@ -25,7 +25,7 @@ class ReachEnv(BatchedEnv):
     forces = 2
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns the point's next place and velocity."""
+        """Returns the step's result: the point's next state, and whether it is at the goal."""
         velocity = DRAG * state[..., 2:] + THRUST * action
         place = state[..., :2] + velocity
         there = (goal(level) - place).square().sum(-1) <= RADIUS**2
@@ -62,11 +62,11 @@ class LureEnv(BatchedEnv):
     draws = 1
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns a place near the origin."""
+        """Returns the initial state [*B, 2]: a place near the origin."""
         return torch.cat([torch.zeros_like(chance), 0.2 * chance - 0.1], -1)
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns the next place: first along x, then along y, unless a wall is in between."""
+        """Returns the step's result: the next place, moved along x, then along y, up to walls."""
         x, y = state.unbind(-1)
         new_x, new_y = (state + STRIDE * action).unbind(-1)
         wall, half = level["distance"] / 2, level["width"] / 2
@@ -103,11 +103,11 @@ class GoalMazeEnv(BatchedEnv):
     draws = 2
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns a place in the corner."""
+        """Returns the initial state [*B, 2]: a place in the corner."""
         return (BORDER - BLOCK) * chance - BORDER
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns the next place, which walls hold up along the axis on which they were met."""
+        """Returns the step's result: the next place; a wall stops the axis on which it is met."""
         length = action.norm(dim=-1, keepdim=True).clamp(min=1)
         place = (state + PACE * action / length).clamp(-BORDER, BORDER)
         inside = (place.abs() < BLOCK).all(-1, keepdim=True)

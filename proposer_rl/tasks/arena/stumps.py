@@ -29,12 +29,12 @@ class StumpsEnv(BatchedEnv):
     draws = 1
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns a walker at the beginning, at rest."""
+        """Returns the initial state [*B, 5]: the walker at the beginning, at rest."""
         nothing = torch.zeros_like(chance).expand(*chance.shape[:-1], 4)
         return torch.cat([nothing, 1 + 0 * chance], -1)
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns where the walker is after a step, and whether it has fallen."""
+        """Returns the step's result: the walker's next state, and whether it has fallen."""
         x, y, along, upwards, rest = state.unbind(-1)
         stands = y <= 0
         jumps = stands & (action[..., 1] > 0)

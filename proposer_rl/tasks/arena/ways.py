@@ -24,7 +24,7 @@ class ForkEnv(BatchedEnv):
     actions = 2
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns the next cell: action 1 leads to the right, 0 to the left."""
+        """Returns the step's result: the next cell, to the right by action 1, to the left by 0."""
         place = state.squeeze(-1) + 2 * action - 1
         right_way = torch.where(level["depth"] > DEEP, -place, place)
         end, trap = right_way >= level["length"], right_way <= -2
@@ -53,12 +53,12 @@ class RecallEnv(BatchedEnv):
     draws = 2
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns the first cell, where the door is shown."""
+        """Returns the initial state [*B, 3]: the first cell, where the door is shown."""
         door = (DOORS * chance[..., 0]).floor()
         return torch.stack([torch.zeros_like(door), door, door], -1)
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns the next cell, or the end behind a door."""
+        """Returns the step's result: the next cell, or the end of the episode behind a door."""
         cell, door, shown = state.unbind(-1)
         last = level["length"] - 1
         left = (cell >= last) & (action > 0)
@@ -95,11 +95,11 @@ class IceEnv(BatchedEnv):
     draws = 2
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns the first cell of the middle."""
+        """Returns the initial state [*B, 2]: the first cell of the middle row."""
         return torch.stack([torch.zeros_like(level["slip"]), level["width"] // 2], -1).float()
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns the next cell."""
+        """Returns the step's result: the next cell, and whether it is a pit or the end."""
         along, across = state.unbind(-1)
         aside = torch.where(chance[..., 1] < 0.5, LEFT, RIGHT)
         move = torch.where(chance[..., 0] < level["slip"], aside, action)
@@ -133,11 +133,11 @@ class FerryEnv(BatchedEnv):
     draws = 1
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns a place on the bank, about opposite the dock."""
+        """Returns the initial state [*B, 2]: a place on the bank, about opposite the dock."""
         return torch.cat([0.4 * chance - 0.2, torch.zeros_like(chance)], -1)
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns the next place."""
+        """Returns the step's result: the ferry's next place, and whether it has landed."""
         drift = STEER * (level["current"] + action[..., 0]) + GUST * (2 * chance[..., 0] - 1)
         aside, across = state[..., 0] + drift, state[..., 1] + 1
         over = across >= STEPS
@@ -170,11 +170,11 @@ class CrowdEnv(BatchedEnv):
     draws = len(LANES)
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns the lower end, and others anywhere in their lanes."""
+        """Returns the initial state: the agent below, the others anywhere in their lanes."""
         return torch.cat([torch.zeros_like(chance[..., :1]), 2 * chance - 1], -1)
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns where everybody is after a step; the others' are of any length up to twice."""
+        """Returns the step's result: all next places, the others' after steps of random length."""
         y = state[..., 0] + level["pace"] * action
         ways = 1 - 2 * (torch.arange(len(LANES), device=y.device) % 2)
         others = _around(state[..., 1:] + ways * 2 * chance * level["speed"].unsqueeze(-1))

@@ -64,13 +64,13 @@ class PointMassEnv(BatchedEnv):
     forces = 2
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns the mass at rest, with its level."""
+        """Returns the initial state: the mass at rest, and its level."""
         x, y = (torch.full_like(level[GATE[0]], place) for place in START_PLACE)
         rest = torch.zeros_like(x)
         return torch.stack([x, rest, y, rest, *(level[name] for name in GATE)], -1)
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns where the mass is after ten substeps."""
+        """Returns the step's result: the mass's state after ten substeps."""
         place, speed, hit = after_substeps(state, action)
         away = torch.hypot(place[0] - GOAL_PLACE[0], place[1] - GOAL_PLACE[1])
         mass = torch.stack([place[0], speed[0], place[1], speed[1]], -1)
