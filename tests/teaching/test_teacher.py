@@ -517,8 +517,8 @@ REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
         lambda t: t.observe(TensorDict({"next": {"done": torch.ones(4, 3, 1)}}, [4, 3])),
         "rollout: has no level_id",
     ),
-    "no return": (lambda t: t.tell(0, None, 1), "return_=None: must be a number"),
-    "no returns": (lambda t: t.tell([0, 1], None, [1, 1]), r"return_: has shape \[\], but"),
+    "no return": (lambda t: t.tell(0, None, 1), "return_: missing"),
+    "no returns": (lambda t: t.tell([0, 1], None, [1, 1]), "return_: missing"),
     "an outcome without names": (
         lambda t: [t.propose(4), t.observe([0.0] * 4)],
         r"outcome=\[0.0, .*: must have results by name",
