@@ -7,7 +7,6 @@ folder, one that fails in a sweep leaves its reason.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shutil
@@ -30,7 +29,7 @@ from yaml import YAMLError
 from proposer_rl.cli.errors import UNFORESEEN, ConfigError, command, exit_code, one_line, refuse
 from proposer_rl.cli.groups import check_chosen, check_groups, explained, overrides
 from proposer_rl.recipes import CONFIG_FOLDER
-from proposer_rl.runs.folder import FAILURE, write_atomically
+from proposer_rl.runs.folder import FAILURE, RunFolder
 from proposer_rl.runs.process import InUseError, StopSignals
 
 LONGEST = 300  # characters of what is said of a lost job
@@ -154,7 +153,7 @@ def _record_failure(folder: Path, error: Exception) -> float:
     message, code = one_line(error, folder), exit_code(error)
     if not isinstance(error, InUseError):
         content = {"message": message, "kind": type(error).__name__, "exit_code": code}
-        write_atomically(folder / FAILURE, (json.dumps(content, indent=2) + "\n").encode())
+        RunFolder(folder).write_json(FAILURE, content)
     if code == UNFORESEEN:
         traceback.print_exception(error)
     print(f"error: {message}", file=sys.stderr)

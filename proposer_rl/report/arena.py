@@ -81,7 +81,7 @@ class Arena:
 
     @cached_property
     def leads(self) -> dict[str, tuple[Estimate, float]]:
-        """By how much the first method leads each other one in the mean, with Holm's p-value."""
+        """The first method's lead over each other one in the mean, with Holm's p-value."""
         first, *others = self.found
         means = [statistics.mean_of_estimates(self._common(first, other)) for other in others]
         corrected = statistics.holm([mean.p for mean in means])
