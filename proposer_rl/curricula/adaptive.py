@@ -70,8 +70,8 @@ ITEMS_LEARNABLE, ITEMS_TIMES = 1.0, 4  # that, and times as many candidates, of 
 NEAR = 0.025  # standard deviation of what is added between two levels, in shares of a range
 # Levels of the way that are assigned to draws of the target together. The time of an assignment
 # grows faster than with the square: of 288, it is 10 ms in blocks of 64, 30 of 128, 150 at once.
-# Blocks of more than MANY are half as large, which takes a third of the time.
-AT_ONCE, MANY = 64, 512
+# Of more than LARGE, blocks are half as large, which takes a third of the time.
+AT_ONCE, LARGE = 64, 512
 FORBIDDEN = 1e3  # cost of a candidate that is not mastered
 FAILURES = 4.0  # on the target, that are taken for seen at the beginning
 LOGGED = 100  # batches at most, whose predictions a log is about
@@ -313,11 +313,11 @@ class AdaptiveMixture(Curriculum):
         allowed = p >= p.topk(count).values[-1].clamp(max=self._delta)
         bonus = ITEMS_LEARNABLE if self._is_data else LEARNABLE
         extra = torch.where(allowed, -bonus * 4 * p * (1 - p), FORBIDDEN)
-        most, start = AT_ONCE if count <= MANY else AT_ONCE // 2, 0
+        most, start = AT_ONCE if count <= LARGE else AT_ONCE // 2, 0
         chosen = []
         while start < count:
             size = min(most, count - start)
-            number = min(MANY, count - start) // size  # of blocks whose costs are taken together
+            number = min(LARGE, count - start) // size  # of blocks whose costs are taken together
             few = slice(times * start, times * (start + number * size))
             every = x[few].view(number, times * size, x.shape[1])
             some = goals[start : start + number * size].view(number, size, x.shape[1])
@@ -365,13 +365,13 @@ def _each(items: Tensor | None, students: int) -> Sequence[Tensor | None]:
 def together(parts: Sequence[TensorDict]) -> list[tuple[TensorDict, float]]:
     """Returns parts of batches [K, m] as they are learned from, and the batches that pass by each.
 
-    Parts of more than MANY levels are joined, with others of one kind, up to a batch.
+    Parts of more than LARGE levels are joined, with others of one kind, up to a batch.
     """
     joined: list[tuple[TensorDict, float]] = []
     for part in parts:
         size = int(part["size"][0, 0])
         share = part.shape[1] / max(size, FEW)
-        if size > MANY and joined:
+        if size > LARGE and joined:
             last, passed = joined[-1]
             if passed + share <= 1 and last.keys() == part.keys():
                 part, share = torch.cat([last, part], 1), passed + share

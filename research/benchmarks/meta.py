@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import resource
-import sys
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +12,7 @@ from proposer_rl.curricula import ProposerTrainer
 from proposer_rl.learning import PPO
 from proposer_rl.meta.env import SolverTrainingEnv
 from proposer_rl.streams import Streams
+from research.benchmarks.memory import peak_memory
 from research.benchmarks.results import Options, Result, Row, Spread, Table
 from research.benchmarks.scales import PAPER, QUICK, TINY, paper
 from research.benchmarks.timing import Timings, interleave, ratio, threads, total
@@ -139,13 +138,6 @@ def memory(options: Options) -> Result:
         ["... and the Proposer's training", f"{peak / 2**30:.2f}"],
     ]
     return Result([row], [Table("Peak resident memory", ["after", "GiB"], lines)])
-
-
-def peak_memory() -> int:
-    """Most bytes of memory that this process has had at any time."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    # macOS counts bytes, every other system kibibytes.
-    return peak if sys.platform == "darwin" else 1024 * peak
 
 
 def trainer_of(made: Made) -> ProposerTrainer:

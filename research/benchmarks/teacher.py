@@ -11,7 +11,7 @@ import torch
 
 from proposer_rl import curricula
 from proposer_rl.teaching import Items, Parameters, Teacher
-from research.benchmarks.meta import peak_memory
+from research.benchmarks.memory import peak_memory
 from research.benchmarks.peer import said_by
 from research.benchmarks.results import Options, Result, Row, Spread
 from research.benchmarks.syllabus_peer import __file__ as SYLLABUS

@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from research.benchmarks.meta import peak_memory
+from research.benchmarks.memory import peak_memory
 from research.benchmarks.registry import measure
 from research.benchmarks.results import Options
 

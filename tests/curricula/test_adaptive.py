@@ -24,6 +24,7 @@ from proposer_rl.curricula import AdaptiveMixture, Batch, Curriculum, SamplingCu
 from proposer_rl.curricula.adaptive import (
     FLOOR,
     HIGH,
+    LARGE,
     LOGGED,
     LOW,
     TARGET,
@@ -31,6 +32,7 @@ from proposer_rl.curricula.adaptive import (
     WAY,
     allotted,
     assigned,
+    together,
 )
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
@@ -146,6 +148,37 @@ def test_assignments_cost_as_little_as_the_best_of_all() -> None:
         found = assigned(costs)
         assert len(set(found.tolist())) == 3
         assert float(costs[range(3), found].sum()) == pytest.approx(float(best))
+
+
+def test_thousands_at_once_are_mastered_too_and_all_different() -> None:
+    curriculum = AdaptiveMixture(LINE, LINE.target)
+    teach(curriculum, below(0.5), 12)
+    batch, _ = following(curriculum, 8 * LARGE)
+    x = batch.levels["x"][0][batch.notes["arm"][0] == WAY]
+    assert len(x) > LARGE and len(x.unique()) == len(x)
+    assert (batch.notes["predicted"][0][batch.notes["arm"][0] == WAY] >= 0.3 - 1e-9).all()
+    assert float(x.mean()) > 0.35 > float(x.amin()) and float(x.amax()) < 0.7
+
+
+@pytest.mark.parametrize(
+    ("sizes", "parts", "expected"),
+    [
+        ([64, 64], [20, 30], [(20, 20 / 64), (30, 30 / 64)]),
+        ([1000, 1000, 1000], [500, 400, 200], [(900, 0.9), (200, 0.2)]),
+        ([1000, 1000, 64], [1000, 1, 5], [(1000, 1.0), (1, 0.001), (5, 5 / 64)]),
+    ],
+)
+def test_parts_of_large_batches_are_learned_from_together(
+    sizes: list[int], parts: list[int], expected: list[tuple[int, float]]
+) -> None:
+    numbers = torch.arange(sum(parts)).split(parts)
+    came = [
+        TensorDict({"size": torch.full((2, m), size), "at": number.expand(2, -1)}, [2, m])
+        for size, m, number in zip(sizes, parts, numbers, strict=True)
+    ]
+    joined = together(came)
+    assert [(len(part["at"][0]), pytest.approx(share)) for part, share in joined] == expected
+    assert torch.cat([part["at"] for part, _ in joined], 1)[1].equal(torch.arange(sum(parts)))
 
 
 def test_the_way_is_mastered_and_nearer_to_the_target_than_uniform_levels() -> None:

@@ -9,6 +9,7 @@ import torch
 
 import proposer_rl as prl
 from proposer_rl.curricula import BoundsCurriculum, Student
+from proposer_rl.curricula.points import Points, nearest
 from proposer_rl.streams import Streams
 from tests.curricula.scripted import Scripted, reached, step
 
@@ -41,6 +42,16 @@ class Simulated:
             self.bounds[key] = min(max(place + out, self.start[key[0]]), 1.0)
         else:
             self.bounds[key] = max(min(place - out, self.start[key[0]]), -1.0)
+
+
+@pytest.mark.parametrize(
+    "space", [SPACE, prl.Items(7, features=torch.rand(7, 2, generator=torch.Generator()))]
+)
+def test_points_become_levels_of_the_nearest_bins_on_grids_and_elsewhere(space: Any) -> None:
+    draw = torch.Generator().manual_seed(0)
+    points = torch.cat([2 * torch.rand(200, 2, generator=draw) - 1, torch.tensor([[0.25, -0.75]])])
+    _, bins = Points(space, True).levels(points.double()[None], [Streams(0)])
+    assert bins[0].equal(nearest(points.double(), space.coordinates.double()))
 
 
 @pytest.mark.parametrize("count", [3, 16])

@@ -22,6 +22,7 @@ from research.benchmarks.ceiling import convolutions
 from research.benchmarks.curricula import Training
 from research.benchmarks.environment import bare_dynamics, draw_actions, through_torchrl
 from research.benchmarks.gymnasium import Trained, read_rows, write_rows
+from research.benchmarks.memory import peak_memory
 from research.benchmarks.plain import PlainPPO, PlainUNet
 from research.benchmarks.plain_env import PlainMaze
 from research.benchmarks.profiling import kind_of
@@ -96,6 +97,14 @@ def test_the_command_writes_a_table_and_a_file_also_when_a_benchmark_fails(
     assert measured["peak_memory"] > 50 * 2**20  # torch alone takes more
     assert Result.from_json(measured["result"]).rows
     assert not list(tmp_path.glob(".*"))
+
+
+def test_memory_is_a_process_s_own_and_not_that_of_the_one_which_started_it() -> None:
+    read = "from research.benchmarks.memory import peak_memory as p; a = p(); x = b'x' * 2**26; "
+    own = [sys.executable, "-c", read + "print(a, p())"]
+    before, after = map(int, subprocess.check_output(own, text=True).split())
+    assert before < peak_memory() / 3  # which has torch
+    assert 0.9 * 2**26 < after - before < 2**27
 
 
 def test_lists_the_benchmarks(bench, capsys) -> None:
