@@ -256,6 +256,6 @@ def test_a_run_goes_on_in_the_precision_that_it_began_with(
 
 
 def test_a_failing_run_of_a_multirun_does_not_take_the_others_with_it(train, capsys) -> None:
-    assert train("-m", "+method=target", "solver.ppo.epochs=0,1", *FEW) == 2
-    assert "solver.ppo.epochs=0: input should be" in capsys.readouterr().err
+    assert train("-m", "+method=target", "solver.batch_size=0,4", *FEW) == 2
+    assert "solver.batch_size=0: input should be" in capsys.readouterr().err
     assert len(list(Path().glob("multirun/*/*/summary.json"))) == 1

@@ -146,7 +146,7 @@ def test_every_source_is_tried() -> None:
 def test_what_is_exact_has_a_sampled_twin(method: str) -> None:
     costs = {}
     for options in ((), ("+score=sampled",)):
-        config = composed(f"+method={method}", "+scale=smoke", *options)
+        config = composed(f"+method={method}", "+scale=smoke", *LITTLE, *options)
         task, learner, curriculum = parts(config, StopSignals())
         student = TaskStudent(task, learner)
         curriculum.propose(student, task.batch_size, [Streams(0, "update", 0)])

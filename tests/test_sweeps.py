@@ -154,7 +154,7 @@ def test_a_run_that_another_process_works_on_has_not_failed(train, capsys) -> No
     [
         # The second is refused before it imports PyTorch, which takes a process most of its time.
         ["task=maze,cartpole", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
-        ["solver.ppo.epochs=0,1", "hydra/launcher=submitit_local"],
+        ["solver.batch_size=0,4", "hydra/launcher=submitit_local"],
     ],
     ids=["joblib", "submitit"],
 )

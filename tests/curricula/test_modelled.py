@@ -22,18 +22,19 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import space_features
 from proposer_rl.tasks.mazes.task import MazeTask
 from proposer_rl.teaching import Items, Parameters, Teacher
+from tests.commands import SMOKE
 from tests.curricula.scripted import Scripted, reached, step
 from tests.curricula.test_contract import same
 from tests.tiny import TASK, composed, sledges, tiny_view_task
 
 ASKS_THE_MODEL_ALONE = [
-    ["+method=model_transport", "+scale=smoke"],
-    ["+method=first_order_sampled", "+scale=smoke"],
-    ["+method=first_order_proposer_sampled", "+scale=smoke"],
-    ["+method=domain_randomization", "+scale=smoke", "+filter=model"],
-    ["+method=learning_progress", "+scale=smoke", "+source=model"],
-    ["+method=ncc", "+scale=smoke", "+source=model"],
-    ["+method=accel", "+scale=smoke", "+score=model"],
+    ["+method=model_transport"],
+    ["+method=first_order_sampled"],
+    ["+method=first_order_proposer_sampled"],
+    ["+method=domain_randomization", "+filter=model"],
+    ["+method=learning_progress", "+source=model"],
+    ["+method=ncc", "+source=model"],
+    ["+method=accel", "+score=model"],
 ]
 
 
@@ -48,7 +49,7 @@ def test_nobody_asks_the_task_how_well_the_student_does(
         asked.append(given)
         return evaluate(self, *given)
 
-    config = composed(*overrides, "compute.progress=false", "schedule.updates=3")
+    config = composed(overrides[0], *SMOKE, *overrides[1:], "schedule.updates=3")
     signals = StopSignals()
     experiment = build(config, parts(config, signals), RunFolder(tmp_path), signals)
     experiment._measure = experiment._measure_levels = lambda: None  # type: ignore[method-assign]

@@ -125,7 +125,7 @@ OF_TEXT = [
     ("S" + "." * 9_000_000 + "G", "level 'bad': 1x9,000,002 cells; at most 16,384 are read"),
     ("S" + "." * 31_998 + "G", "level 'bad': 1x32,000 cells"),
     (serpentine(400), "level 'bad': 400x400 cells"),
-    ("".join(f"[{i}]\nSG\n" for i in range(800_000)), "holds 800,000 levels; at most 10,000"),
+    ("".join(f"[{i}]\nSG\n" for i in range(10_001)), "holds 10,001 levels; at most 10,000"),
 ]
 OF_JSON = [
     ("{", "is no JSON"),
