@@ -292,6 +292,7 @@ def test_a_recipe_and_its_name_have_one_state() -> None:
 LOGGED = ["proposed", "told", "dropped", "out", "mean_return", "mean_success", "drawn"]
 
 
+@pytest.mark.filterwarnings("ignore:success. told of some levels")
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("name", ["domain_randomization", "plr"])
 def test_a_log_counts_what_went_out_and_came_back(name: str, space: str, tmp_path: Path) -> None:
