@@ -79,9 +79,9 @@ class TeacherSampler(Sampler[int]):
         rounds: Count = 1,
         sources: Any = None,
     ) -> None:
-        require_items(teacher)
-        if sources is not None and len(sources) != teacher.space.size:
-            raise ArgumentError(f"sources: {len(sources)} for {teacher.space.size} items")
+        count = items_of(teacher).size
+        if sources is not None and len(sources) != count:
+            raise ArgumentError(f"sources: {len(sources)} for {count} items")
         self._teacher, self._length = teacher, length
         self._repeat, self._group, self._rounds = repeat, group, rounds
         self._out: dict[int, list[int]] = defaultdict(list)  # tickets of each item
@@ -320,7 +320,7 @@ def mixed_groups(
         ArgumentError: if its results are no such numbers, or G is 1 or another than before, whose
             items are dropped then; if the teacher's levels are no items of one student.
     """
-    require_items(teacher)
+    items_of(teacher)
     drawn: list[int] = []
     groups: list[Tensor] = []
     places: list[int] = []
@@ -350,14 +350,15 @@ def mixed_groups(
     )
 
 
-def require_items(teacher: Teacher) -> None:
-    """Refuses a teacher of other levels than items, or of several students.
+def items_of(teacher: Teacher) -> Items:
+    """Returns the items that a teacher proposes to its student.
 
     Raises:
-        ArgumentError: in one line.
+        ArgumentError: if its levels are no items, or it has several students.
     """
     if not isinstance(teacher.space, Items) or teacher.students > 1:
         raise ArgumentError("teacher: must have a space of Items, and one student")
+    return teacher.space
 
 
 def _of_groups(given: Any, count: int) -> Tensor:

@@ -14,7 +14,7 @@ from transformers import TrainerCallback
 
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.settings import ArgumentError
-from proposer_rl.teaching.sampler import TeacherSampler, require_items
+from proposer_rl.teaching.sampler import TeacherSampler, items_of
 from proposer_rl.teaching.teacher import Teacher
 
 ROW = "teacher_item"  # the column of the training set that says which row it is
@@ -56,11 +56,10 @@ class TaughtReward(TrainerCallback):
         reward: Callable[..., Sequence[float | None]],
         source: str | None = None,
     ) -> None:
-        require_items(teacher)
+        rows = items_of(teacher).size
         if not callable(reward) or iscoroutinefunction(reward):
             raise ArgumentError("reward: must be a function, no coroutine: ranks are told in step")
-        space: Any = teacher.space
-        self._teacher, self._rows, self._reward = teacher, space.size, reward
+        self._teacher, self._rows, self._reward = teacher, rows, reward
         self._source = source
         self._told = 0  # generations
         self._again = False  # whether the next one repeats the last that was reported
