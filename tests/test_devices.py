@@ -25,14 +25,17 @@ from tests.tasks.gymnasium.toys import CHOICES, GATE, TINY
 FEW = ["compute.progress=false", "solver.ppo.epochs=1", "schedule.updates=3"]
 FEW += ["schedule.evaluate_every=3"]
 CYCLE = ["schedule.updates=2", "schedule.evaluate_every=2", "proposer.meta_episode_length=2"]
+CYCLE += ["proposer.ppo.epochs=1"]
 SHORT = ["solver.ppo.horizon=5", "task.maze.max_steps=5", "task.evaluation.levels=2"]
+# One kind of mazes is measured and one length drawn: each is generated operation by operation.
+ONE = ["task.evaluation.distributions=[id]", "task.space.path_lengths=[4]"]
 QUIET = ["+scale=smoke", *FEW, *SHORT, "task.network.channels=[8,8]"]
 SEEDS = ["+method=target", "seeds=[0,1]", *QUIET]
 FITTED = ["curriculum.warmup=4", "curriculum.refit=4", "curriculum.components=2"]
 NORMALIZED = [f"solver.ppo.normalize_{name}=true" for name in ("observations", "rewards")]
 CALLED = {
     "plr": ["+method=plr", *QUIET],
-    "perf_gain": ["+method=perf_gain", *QUIET, *CYCLE],
+    "perf_gain": ["+method=perf_gain", *QUIET, *CYCLE, *ONE],
     "alp_gmm": ["+method=alp_gmm", *QUIET, *FITTED],
     "paper_literal": ["+method=perf_gain", "+ablation=paper_literal", *QUIET, *CYCLE],
     "filtered": ["+method=hand_designed", "+filter=learnability", *QUIET],

@@ -44,7 +44,7 @@ from proposer_rl.models import (
     proposer_actor_critic,
 )
 from proposer_rl.streams import Streams
-from tests.tiny import TASK
+from tests.curricula.living import TASK
 
 Make = Callable[[], Curriculum]
 SPACE, TARGET, P = TASK.space, TASK.target, TASK.batch_size

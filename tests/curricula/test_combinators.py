@@ -29,10 +29,10 @@ from proposer_rl.curricula.batches import fresh_levels
 from proposer_rl.curricula.buffer import level_keys
 from proposer_rl.curricula.combinators import draw_without_replacement
 from proposer_rl.streams import Streams
-from tests.curricula.living import live, solvers
+from tests.curricula.living import TASK, live, solvers
 from tests.curricula.made import LEARNED, filtered, learnt
 from tests.curricula.scripted import GivenScores
-from tests.tiny import TASK, evaluate
+from tests.tiny import evaluate
 
 P, T = TASK.batch_size, 8
 INF = float("inf")

@@ -31,9 +31,9 @@ from proposer_rl.curricula.student import ABILITIES
 from proposer_rl.learning import PPO
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.streams import Streams
-from tests.curricula.living import Lived, live, solvers
+from tests.curricula.living import TASK, Lived, live, solvers
 from tests.curricula.made import LEARNED, MADE, Make, P, replay
-from tests.tiny import TASK, mountain_cars, tiny_view_task
+from tests.tiny import mountain_cars, tiny_view_task
 
 EVERY = {**MADE, **LEARNED}
 every = pytest.mark.parametrize("make", EVERY.values(), ids=EVERY)

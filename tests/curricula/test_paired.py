@@ -11,10 +11,10 @@ from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
-from tests.curricula.living import live, solvers, student
+from tests.curricula.living import TASK, live, solvers, student
 from tests.curricula.made import filtered, paired
 from tests.tasks.gymnasium.toys import walk_task
-from tests.tiny import TASK, evaluate
+from tests.tiny import evaluate
 
 P, T = 4, 8
 
@@ -30,7 +30,7 @@ def test_equal_students_have_no_regret() -> None:
 def test_the_reward_is_what_the_antagonist_gets_more(times: int) -> None:
     curriculum, learner = paired(), solvers([0])
     antagonist = TASK.learner([Streams(0, "antagonist")]).agent
-    levels = TASK.space.sample(P, torch.Generator().manual_seed(1))
+    levels = TASK.space.sample(P, torch.Generator().manual_seed(2))
     regret, _ = curriculum.reward(student(0), levels.unsqueeze(0), Streams(0))
     other, own = (evaluate(agent, levels)["return"][0] for agent in (antagonist, learner.agent))
     torch.testing.assert_close(regret[0], (other - own).clamp_min(0))

@@ -27,9 +27,9 @@ from proposer_rl.learning import PPO, DivergedError
 from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import planes
-from tests.curricula.living import live, solvers, student
+from tests.curricula.living import TASK, live, solvers, student
 from tests.curricula.made import MADE, ncc, replay
-from tests.tiny import TASK, composed, evaluate
+from tests.tiny import composed, evaluate
 
 P, T = 4, 8
 

@@ -10,10 +10,10 @@ from proposer_rl.curricula.batches import fresh_levels
 from proposer_rl.curricula.buffer import level_keys
 from proposer_rl.learning import DivergedError
 from proposer_rl.streams import Streams
-from tests.curricula.living import live, solvers, student
+from tests.curricula.living import TASK, live, solvers, student
 from tests.curricula.made import selection
 from tests.curricula.scripted import GivenScores
-from tests.tiny import TASK, evaluate
+from tests.tiny import evaluate
 
 P, T = 4, 8
 

@@ -19,8 +19,9 @@ TASKS = {
     "maze": ["+scale=smoke"],
     "view_maze": ["task=view_maze_smoke"],
     "cartpole_memory": ["task=cartpole", *TINY, "task.network.memory=8"],
-    "minigrid": ["task=minigrid", *TINY],  # minibatches, a clipped value loss, convolutions
-    "point_mass": ["task=point_mass", *GATE],
+    # Minibatches, a clipped value loss, convolutions. Tracing takes as long as there are layers.
+    "minigrid": ["task=minigrid", *TINY, "task.network.channels=[4]", "task.network.hidden=[8]"],
+    "point_mass": ["task=point_mass", *GATE, "task.network.hidden=[8]"],
 }
 QUICK = ("minigrid", "point_mass")
 
