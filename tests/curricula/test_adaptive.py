@@ -287,7 +287,7 @@ def draw(n: int, generator: torch.Generator) -> Tensor:
     ("features", "message"),
     [
         (lambda levels: levels[:, 0], r"^features=\[1\]: must give a row .* each of 1 levels$"),
-        (lambda levels: levels / 0, r"^features=\[\[inf, inf\]\]: must give finite numbers$"),
+        (lambda levels: levels / 0, r"^features=\[\[inf, inf\]\]: must give finite float32$"),
         (lambda levels: levels[:1].repeat(2, 1), r"^features=\[2, 2\]: .* of 1 levels$"),
         (lambda levels: [["a"]], r"^features=.*: must be numbers \[N, D\]$"),
         (
