@@ -9,10 +9,11 @@ the success on the target lately, their shares are
 The target gets more the more often it is solved: there training pays most. While it is never
 solved, ``low`` lies between FLOOR, where its episodes alone all return the same and teach nothing,
 and LOW, where they differ at least half as much as all episodes do. Of what is left the way gets a
-part q that grows with the skill of the belief, 1 - its squared errors on uniform levels over those
-of their mean. Uniform sampling is never given up, as beliefs may be wrong; with little skill it
-leads. b is the largest that was seen, which fades with the half-life LATER, so that a target that
-is forgotten while others are trained on is not left alone.
+part q that grows with the skill of the belief, the correlation of what it predicted with what came
+on uniform levels: the way needs to know which levels are easier, and a student that improves is
+ahead of any forecast of how often it succeeds. Uniform sampling is never given up, as beliefs may
+be wrong; with little skill it leads. b is the largest that was seen, which fades with the half-life
+LATER, so that a target that is forgotten while others are trained on is not left alone.
 
 For the way, each of some draws of the target gets the candidate of its own that is nearest to it
 among those whose expected success is at least ``delta``, by optimal assignment with squared
@@ -57,12 +58,15 @@ ARMS = ("target", "uniform", "way")
 TARGET, UNIFORM, WAY = range(3)
 SUMS = (
     *("levels", "successes", "labels", "squared labels"),
-    *("errors", "returns", "squared returns"),
+    *("predicted", "squared predicted", "products"),
+    *("returns", "squared returns"),
 )
 FLOOR, LOW, HIGH = 0.1, 0.25, 0.9  # of the share of the target
 HALF, HALF_OF_RETURNS = 0.1, 0.5  # b at half of the way from low to HIGH; where success is not told
 WAY_LEAST, WAY_AT_ONCE, WAY_MOST = 0.2, 0.4, 0.8  # part q: with no skill it is that in the middle
 SOON, LATER = 6.0, 20.0  # half-lives in batches: of sums, and of b where success falls again
+# Added to the sums of squares of predictions and labels that a correlation is of: a few say little.
+UNSURE = 0.05, 0.5
 FEW = 16  # levels, of which fewer are counted as a part of a batch
 RARE = 0.02  # share of successes, below which the belief learns from returns, too
 LEARNABLE = 0.2  # of the bonus, in squared distances per input
@@ -223,7 +227,9 @@ class AdaptiveMixture(Curriculum):
                 "successes": success,
                 "labels": labels,
                 "squared labels": labels.square(),
-                "errors": (seen["predicted"] - labels).square(),
+                "predicted": seen["predicted"],
+                "squared predicted": seen["predicted"].square(),
+                "products": seen["predicted"] * labels,
                 "returns": returns,
                 "squared returns": returns.square(),
             }
@@ -254,7 +260,6 @@ class AdaptiveMixture(Curriculum):
     def _shares(self) -> Tensor:
         """Returns the shares of the arms in the next batch, float64 [K, 3]."""
         sums = dict(zip(SUMS, self._sums.unbind(-1), strict=True))
-        count = sums["levels"]
 
         def variance(name: str, of: Callable[[Tensor], Tensor]) -> Tensor:
             """Returns the variance of what was summed up, of some arms: [K]."""
@@ -266,9 +271,15 @@ class AdaptiveMixture(Curriculum):
         own = variance("returns", lambda one: one[:, TARGET])
         signal = (own / variance("returns", lambda one: one.sum(1))).sqrt()
         signal = signal.nan_to_num(1.0, posinf=1.0).clamp(max=1)  # before anything is seen
-        number = count[:, UNIFORM]
-        constant = (number * variance("labels", lambda one: one[:, UNIFORM])).nan_to_num(0.0)
-        skill = 1 - (sums["errors"][:, UNIFORM] + 1) / (constant + 1)
+        number, came, expected, products = (
+            sums[name][:, UNIFORM] for name in ("levels", "labels", "predicted", "products")
+        )
+        squares = [
+            number * variance(name, lambda one: one[:, UNIFORM]) + unsure
+            for name, unsure in zip(("predicted", "labels"), UNSURE, strict=True)
+        ]
+        covered = products - expected * came / number
+        skill = (covered / (squares[0] * squares[1]).sqrt()).nan_to_num(0.0)
         low = FLOOR + (LOW - FLOOR) * (2 * signal).clamp(max=1)
         half = HALF if self._told else HALF_OF_RETURNS
         target = low + (HIGH - low) * self._best / (self._best + half)
