@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy  # whose functions are loaded where they are asked for: a run's picture asks none
 from numpy.typing import NDArray
-from scipy import special, stats
 
 CONFIDENCE = 0.95
 ERROR = 1 - CONFIDENCE  # how often a test may be wrong
@@ -55,13 +55,13 @@ class Estimate(NamedTuple):
 
     def interval(self, confidence: float = CONFIDENCE) -> Interval:
         """Returns Student's confidence interval."""
-        half = self.error * float(special.stdtrit(self.freedom, (1 + confidence) / 2))
+        half = self.error * float(scipy.special.stdtrit(self.freedom, (1 + confidence) / 2))
         return Interval(self.value, self.value - half, self.value + half)
 
     @property
     def p(self) -> float:
         """Two-sided p-value against zero."""
-        return float(2 * special.stdtr(self.freedom, -abs(self.value) / self.error))
+        return float(2 * scipy.special.stdtr(self.freedom, -abs(self.value) / self.error))
 
 
 def mean_of(values: Values) -> Estimate:
@@ -145,7 +145,7 @@ def median_of(values: Values) -> tuple[Any, Any, Any]:
     rows = np.sort(np.asarray(values, dtype=float), 0)  # what is missing comes last
     known = np.isfinite(rows).sum(0)
     middle = np.take_along_axis(rows, np.stack([(known - 1) // 2, known // 2]).clip(0), 0).mean(0)
-    rank = int(stats.binom.ppf((1 - HELD) / 2, len(rows), 0.5))
+    rank = int(scipy.stats.binom.ppf((1 - HELD) / 2, len(rows), 0.5))
     low, high = rows[[rank - 1, -rank]]
     whole = (known == len(rows)) & (rank > 0)
     return middle, np.where(whole, low, math.nan), np.where(whole, high, math.nan)
@@ -158,7 +158,7 @@ def median_interval(values: Values) -> Interval:
 
 def interquartile_mean(values: Values) -> float:
     """Returns the mean of the middle half of the values (Agarwal et al., NeurIPS 2021)."""
-    return float(stats.trim_mean(np.asarray(values, dtype=float), QUARTER, axis=None))
+    return float(scipy.stats.trim_mean(np.asarray(values, dtype=float), QUARTER, axis=None))
 
 
 def jackknife(
@@ -195,8 +195,8 @@ def probability_of_improvement(one: Values, other: Values) -> Interval:
     if count < FEWEST:
         return Interval(share, math.nan, math.nan)
     wins, losses = share * count, count - share * count
-    low = special.betaincinv(wins, losses + 1, ERROR / 2) if wins else 0.0
-    high = special.betaincinv(wins + 1, losses, 1 - ERROR / 2) if losses else 1.0
+    low = scipy.special.betaincinv(wins, losses + 1, ERROR / 2) if wins else 0.0
+    high = scipy.special.betaincinv(wins + 1, losses, 1 - ERROR / 2) if losses else 1.0
     return Interval(share, float(low), float(high))
 
 
@@ -235,10 +235,10 @@ def seeds_needed(difference: Estimate, seeds: int, level: float) -> int | None:
 
     def enough(count: int) -> bool:
         freedom = difference.freedom * count / seeds
-        quantiles = special.stdtrit(freedom, [1 - level / 2, POWER])
+        quantiles = scipy.special.stdtrit(freedom, [1 - level / 2, POWER])
         return bool(quantiles.sum() <= effect * math.sqrt(count / seeds))
 
-    quantiles = special.ndtri([1 - level / 2, POWER])
+    quantiles = scipy.special.ndtri([1 - level / 2, POWER])
     least = math.floor(seeds * (float(quantiles.sum()) / effect) ** 2)  # of a normal distribution
     if least > MOST_SEEDS:
         return None

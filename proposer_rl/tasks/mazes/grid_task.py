@@ -66,7 +66,6 @@ class GridTask(Task):
 
     def __init__(
         self,
-        *,
         maze: Any,
         distributions: Mapping[str, Any],
         target: str,

@@ -97,14 +97,7 @@ class MazeTask(GridTask):
         if self.exact_performance:
             self.replayed += ("performance",)
         super().__init__(
-            maze=maze,
-            distributions=distributions,
-            target=target,
-            space=space,
-            encoder_channels=encoder_channels,
-            evaluation=evaluation,
-            solver=solver,
-            context=context,
+            maze, distributions, target, space, encoder_channels, evaluation, solver, context
         )
         self.title = f"{maze.height}×{maze.width} mazes"
         for name in sorted({target, *evaluation.distributions}):

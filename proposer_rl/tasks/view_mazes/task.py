@@ -114,14 +114,7 @@ class ViewMazeTask(GridTask):
         self._named_episodes = evaluation.named_episodes
         self._draws = Streams(evaluation.seed, "scores")  # of named levels
         super().__init__(
-            maze=maze,
-            distributions=distributions,
-            target=target,
-            space=space,
-            encoder_channels=encoder_channels,
-            evaluation=evaluation,
-            solver=solver,
-            context=context,
+            maze, distributions, target, space, encoder_channels, evaluation, solver, context
         )
         self.title = f"{maze.height}×{maze.width} mazes seen through 5×5 cells"
         self.board = ViewBoard(self, self._named_episodes, self._draws)
