@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import pickle
 from contextlib import suppress
@@ -12,11 +13,13 @@ from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra._internal import config_loader_impl
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.config_repository import CachingConfigRepository
 from hydra._internal.defaults_list import DefaultsList, create_defaults_list
 from hydra._internal.hydra import Hydra
 from hydra.core.default_element import ResultDefault
 from hydra.core.override_parser.types import Override
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, flag_override
+from omegaconf.errors import OmegaConfBaseException
 
 from proposer_rl.recipes import CONFIG_FOLDER
 
@@ -34,6 +37,11 @@ def load_once(file: Any) -> Any:
     if key not in read:
         read[key] = pickle.dumps(load_file(file))
     return pickle.loads(read[key])  # a copy, at a third of what deepcopy takes
+
+
+def copy_little(self: CachingConfigRepository, delegate: Any) -> None:
+    """Hydra's copy may get other sources, but a list of its own: nothing deeper is changed."""
+    self.delegate, self.cache = copy.copy(delegate), {}
 
 
 def only_ours(repo: Any) -> bool:
@@ -70,12 +78,22 @@ composed: dict[str, bytes] = {}
 
 
 def compose_once(self: ConfigLoaderImpl, defaults: list[ResultDefault], repo: Any) -> DictConfig:
-    """The same files, one merged into the other, are the same."""
+    """The same files, one merged into the other, are the same; most share all but the last ones."""
     if not only_ours(repo):
         return compose(self, defaults, repo)
     key = repr([(default, default.override_key) for default in defaults])
     if key not in composed:
-        composed[key] = pickle.dumps(compose(self, defaults, repo))
+        *before, last = defaults
+        config = compose(self, [last], repo)
+        if before:
+            first, second = compose_once(self, before, repo), config
+            try:
+                with flag_override(first, "no_deepcopy_set_nodes", True):
+                    first.merge_with(second)
+                config = first
+            except OmegaConfBaseException:
+                config = compose(self, defaults, repo)  # Hydra says what does not fit
+        composed[key] = pickle.dumps(config)
     return pickle.loads(composed[key])
 
 
@@ -91,6 +109,7 @@ def mode_at_once(self: Hydra, config_name: str | None, overrides: list[str]) -> 
 def remember() -> None:
     """Let Hydra work so in this process, and in those that it forks into."""
     OmegaConf.load = staticmethod(load_once)
+    CachingConfigRepository.__init__ = copy_little
     config_loader_impl.create_defaults_list = list_once
     ConfigLoaderImpl._compose_config_from_defaults_list = compose_once
     Hydra.get_mode = mode_at_once

@@ -47,6 +47,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.parent == Path(__file__).parent / "research":
             item.add_marker("research")
+    # First what lasts longest, so that no process waits at the end for another's; they share one
+    # process that forks.
+    long = {"processes", "call_there"}
+    first = {item.path for item in items if long & {*getattr(item, "fixturenames", ())}}
+    items.sort(key=lambda item: item.path not in first)
 
 
 def pytest_collection_finish() -> None:

@@ -1,17 +1,14 @@
 """A device in Python that refuses what CUDA refuses: to mix its tensors with those of the CPU.
 
 Its numbers are the CPU's. Where another device is registered, torch behaves differently all over
-the process, so what is to run on it has a process of its own: ``python -m tests.pretended_gpu``.
+the process, so what is to run on it has a process of its own: see tests/processes.py.
 It knows no autocast, pinned memory or streams, and of graphs what may not be in them: numbers that
 go from a device to the other.
 """
 
 from __future__ import annotations
 
-import gc
-import json
 import sys
-import traceback
 from pathlib import Path
 from typing import Any
 
@@ -202,20 +199,9 @@ def train(folder: Path, overrides: list[str]) -> None:
 
 
 def main() -> None:
-    """Read runs, a line each, and write for each how it went, a line each, in JSON."""
+    """Make the run whose folder and settings are the arguments."""
     register()
     torch.set_num_threads(1)
-    gc.freeze()
-    for line in sys.stdin:
-        folder, *overrides = json.loads(line)
-        said = ""
-        try:
-            with Device():
-                train(Path(folder), overrides)
-        except Exception:  # whatever it is, the test tells it
-            said = traceback.format_exc()
-        print(json.dumps(said), flush=True)
-
-
-if __name__ == "__main__":
-    main()
+    folder, *overrides = sys.argv[1:]
+    with Device():
+        train(Path(folder), overrides)

@@ -58,6 +58,7 @@ class Request:
         largest_file: bytes; RLIMIT_FSIZE.
         as_anyone: give up root's right to write where permissions forbid it.
         folder: where the child works.
+        module: whose ``main`` is called, with the arguments in ``sys.argv``.
     """
 
     arguments: list[str]
@@ -66,6 +67,7 @@ class Request:
     largest_file: int | None = None
     as_anyone: bool = False
     folder: str = "."
+    module: str = "proposer_rl.cli.train"
 
 
 class Processes:
@@ -137,15 +139,15 @@ def serve() -> None:
         values["signal_at"] = {int(k): v for k, v in values["signal_at"].items()}
         request = Request(**values)
         composing.prepare(tuple(given for given in request.arguments if given[0] == "+"))
-        print(json.dumps(vars(_fork(request, train.main))), flush=True)
+        print(json.dumps(vars(_fork(request))), flush=True)
 
 
-def _fork(request: Request, main: Any) -> Ended:
+def _fork(request: Request) -> Ended:
     said, counted = os.memfd_create("output"), os.memfd_create("writes")
     started = time.monotonic()
     child = os.fork()
     if child == 0:
-        _become_child(request, main, said, counted)
+        _become_child(request, said, counted)
     for delay, signum in request.signals:
         while time.monotonic() - started < delay and not _has_ended(child):
             time.sleep(0.001)
@@ -165,7 +167,7 @@ def _has_ended(child: int) -> bool:
     return os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
 
 
-def _become_child(request: Request, main: Any, said: int, counted: int) -> None:
+def _become_child(request: Request, said: int, counted: int) -> None:
     code = 1
     try:
         os.dup2(said, 1)
@@ -179,7 +181,7 @@ def _become_child(request: Request, main: Any, said: int, counted: int) -> None:
             _give_up_override()
         tqdm.set_lock(RLock())  # its own would be shared with other processes
         sys.argv = ["proposer-train", *request.arguments]
-        main()
+        import_module(request.module).main()
         code = 0
     except SystemExit as end:
         code = int(end.code or 0)

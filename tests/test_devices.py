@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +14,7 @@ from torch.utils import backend_registration
 from proposer_rl.curricula import Batch, Curriculum, SamplingCurriculum, Student
 from proposer_rl.methods import Components
 from proposer_rl.runs.folder import read_csv
-from tests.processes import ROOT
+from tests.processes import Processes
 from tests.same_run import assert_same_run
 from tests.tasks.gymnasium.toys import CHOICES, GATE, TINY
 
@@ -57,20 +54,15 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-@pytest.fixture(scope="module")
-def run_there() -> Iterator[Run]:
+@pytest.fixture
+def run_there(processes: Processes) -> Run:
     """Makes a run on the device; returns what went wrong."""
-    command = [sys.executable, "-m", "tests.pretended_gpu"]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, cwd=ROOT, **pipes) as process:
 
-        def run(folder: Path, *overrides: str) -> str:
-            process.stdin.write(json.dumps([str(folder), *overrides]) + "\n")
-            process.stdin.flush()
-            return json.loads(process.stdout.readline())
+    def run(folder: Path, *overrides: str) -> str:
+        ended = processes(str(folder), *overrides, module="tests.pretended_gpu")
+        return ended.output if ended.code else ""
 
-        yield run
-        process.stdin.close()
+    return run
 
 
 OTHERS = [pytest.param(name, marks=pytest.mark.slow) for name in CALLED if name != "perf_gain"]

@@ -13,6 +13,7 @@ from tests.same_run import assert_same_run
 
 # A checkpoint at every safe point. Episodes of a Proposer's copies are none: they are played again.
 FEW = [*SMOKE, "schedule.checkpoint_seconds=1e-6", "schedule.updates=4"]
+FEW += ["proposer.ppo.epochs=1", "task.evaluation.distributions=[id]", "task.evaluation.levels=2"]
 # At any time; before any write; in the middle of a checkpoint's temporary file; before it gets its
 # name: a run meets them one after another. In one process every curriculum is taken up from its
 # state, in tests/curricula/test_contract.py; this one has a Proposer that learns, too.

@@ -35,6 +35,12 @@ def learner(task: str, copies: int) -> PPO:
     return ppo
 
 
+@pytest.fixture(autouse=True)
+def _traced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is compiled is traced, which tells its graphs, and runs as it is."""
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+
+
 @pytest.mark.parametrize("copies", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "task", [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in TASKS]
@@ -44,8 +50,7 @@ def test_numbers_are_the_same_but_for_rounding(
 ) -> None:
     """One graph but for an LSTM through time, which stays what it is."""
     whole = "memory" not in task and "view" not in task
-    traced = partial(torch.compile, backend="eager", fullgraph=whole)
-    monkeypatch.setattr(torch, "compile", traced)
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, fullgraph=whole))
     plain, compiled = learner(task, copies), learner(task, copies).compile()
     for _ in range(2):
         one, other = (

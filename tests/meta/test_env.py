@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from proposer_rl.learning import DivergedError
+from proposer_rl.learning import PPO, DivergedError, PPOSettings, SolverSettings
 from proposer_rl.meta.actions import Mixture, ProblemChoices
 from proposer_rl.meta.env import SolverTrainingEnv, SolverView
 from proposer_rl.meta.rewards import (
@@ -22,10 +22,21 @@ from proposer_rl.meta.rewards import (
 )
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
-from tests.tiny import TASK, evaluate, learners
+from proposer_rl.tasks.mazes.maze_settings import UNetSettings
+from tests.tiny import evaluate, tiny_task
 
 K, P, C, E, L = 3, 4, 2, 6, 3
+# What an episode is does not hang on how much is computed in it; steps are large, to be seen.
+TASK = tiny_task(
+    network=UNetSettings(channels=[8], groups=4),
+    solver=SolverSettings(batch_size=P, ppo=PPOSettings(horizon=8, epochs=1, learning_rate=2e-2)),
+)
 SPACE = TASK.space
+
+
+def learners(copies: int) -> PPO:
+    """As many copies of one Solver, the same in every call."""
+    return TASK.learner([Streams(0, "solver")] * copies)
 
 
 def meta_env(
