@@ -29,8 +29,7 @@ from proposer_rl.models import (
     proposer_actor_critic,
 )
 from proposer_rl.streams import Streams
-from tests.meta.test_env import SPACE, E, K, L, P, meta_env, mixture
-from tests.tiny import TASK, learners
+from tests.meta.test_env import SPACE, TASK, E, K, L, P, learners, meta_env, mixture
 
 HELD = {"mix": True, "meta_episode_length": 4, "action_repeat": 2}
 
