@@ -170,6 +170,20 @@ def test_a_level_is_drawn_with_keys_alone(tab: Tab, page: Page, tmp_path: Path) 
     expect(tab.locator("#status")).to_have_text(success(page.run, resized, 2))
 
 
+def test_nothing_moves_while_a_level_is_evaluated(tab: Tab) -> None:
+    status = tab.locator("#status")
+    expect(status).to_contain_text("success")
+    button = tab.get_by_role("button", name="Save", exact=True)
+    before = button.bounding_box()
+    tab.route("**/examine", lambda route: None)  # holds what is asked
+    drag(tab, (1, 0), (1, 3))
+    expect(row_of(tab, "Shortest path")).to_contain_text("………")
+    assert button.bounding_box() == before
+    tab.unroute("**/examine")
+    expect(row_of(tab, "Shortest path")).to_contain_text("yes8")
+    assert button.bounding_box() == before
+
+
 def test_the_slider_shows_every_checkpoint(tab: Tab, page: Page) -> None:
     empty = ["S....", ".....", ".....", ".....", "....G"]
     for number in (0, 1, 2):

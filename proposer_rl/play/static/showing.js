@@ -71,7 +71,8 @@ function showResults() {
   const { found, playing } = state;
   const body = $("results").tBodies[0];
   if (!found) {
-    body.replaceChildren();
+    // The rows stay, so that what lies below does not move under the mouse at each stroke.
+    for (const cell of body.querySelectorAll("td")) cell.textContent = "…";
     return;
   }
   const { results, paths, max_steps: limit, step_penalty: cost, missed } = found;
