@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
@@ -42,15 +43,25 @@ class ParameterSettings(RangeSettings):
         name: of the attribute (dots lead to parts of the environment, numbers to elements),
             argument, option or function (which must be given), or of several that all get the
             value; None for the parameter's own name.
+        to: what each of ``values`` stands for, where that is no number: texts, lists, truth values.
     """
 
     set: Literal["attribute", "argument", "option", "call"] = "attribute"
     name: str | Annotated[list[str], Len(1)] | None = None
+    to: list[Any] | None = None
+
+    def __post_init__(self) -> None:
+        if self.to is not None and len(self.to) != len(self.values or []):
+            raise ValueError(f"to={self.to}: must be one for each of values={self.values}")
 
     def names(self, own: str) -> list[str]:
         """Returns the names that get the value of the parameter, whose own name is given."""
         name = own if self.name is None else self.name
         return [name] if isinstance(name, str) else name
+
+    def given(self, value: float) -> Any:
+        """Returns what the environment gets for a value, as nothing has changed it yet."""
+        return value if self.to is None else deepcopy(self.to[(self.values or []).index(value)])
 
 
 class RefusedLevelError(ValueError):
@@ -231,7 +242,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
     def strays(self) -> str | None:
         """Returns a line on what of the level the environment has lost; None where all is there."""
         for name, how, path in self._ways:
-            line = how == "attribute" and stray(self.env, path, self._play.values[name])
+            line = how == "attribute" and stray(self.env, path, self._value(name))
             if line:
                 return f"parameters.{name}: {line}"
         return None
@@ -242,7 +253,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             self.env = self._built()
         inner = self.env.unwrapped
         for name, how, path in self._ways:
-            value = self._play.values[name]
+            value = self._value(name)
             if how == "attribute":
                 try:
                     write_attribute(inner, path, value)
@@ -265,10 +276,12 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
                 raise self._refused(error) from error
             raise UnfitEnvironmentError(f"it cannot be made: {cause(error)}") from error
 
-    def _named(self, way: str) -> dict[str, float]:
+    def _named(self, way: str) -> dict[str, Any]:
         """Returns the values that are set in one way, by the names that they have there."""
-        values = self._play.values
-        return {name: values[parameter] for parameter, how, name in self._ways if how == way}
+        return {name: self._value(parameter) for parameter, how, name in self._ways if how == way}
+
+    def _value(self, parameter: str) -> Any:
+        return self.parameters[parameter].given(self._play.values[parameter])
 
     def _refused(self, error: Exception) -> RefusedLevelError:
         return RefusedLevelError(

@@ -163,7 +163,11 @@ class GymnasiumTask(Task):
         self._measured = {
             "environment": [env_id, arguments, list(wrappers), [repr(t) for t in transforms or []]],
             "steps": self.max_steps,
-            "parameters": {name: asdict(p) for name, p in parameters.items()},
+            "parameters": {
+                # Runs from before there was `to` are comparable where there still is none.
+                name: {key: said for key, said in asdict(p).items() if key != "to" or said}
+                for name, p in parameters.items()
+            },
             "success": asdict(success),
             "evaluation": asdict(evaluation),
             "train_seeds": train_seeds,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -48,7 +48,8 @@ def tried(
 ) -> int:
     """Plays an episode on a level of the target, and short ones at both ends of each parameter.
 
-    At the ends of a parameter's bins all others are as in the target.
+    At the ends of a parameter's bins all others are as in the target. Where its values stand for
+    something else, each is tried.
 
     Returns:
         Steps of an episode at most.
@@ -72,9 +73,9 @@ def tried(
     _check_kinds(player, bins)
     _check_episode(player, success, limit)
     for name, part in bins.items():
-        ends = part.low[0].item(), part.high[-1].item()
-        plays = [target._replace(values={**target.values, name: end}) for end in ends]
-        _check_ends(player, name, plays)
+        some = part.ends if parameters[name].to is None else part.low.tolist()
+        plays = [target._replace(values={**target.values, name: one}) for one in some]
+        _check_values(player, name, plays)
     player.close()
     return limit
 
@@ -193,7 +194,7 @@ def _check_reachable(player: LevelPlayer, least: float, rewards: list[float], li
 def _check_kinds(player: LevelPlayer, bins: Mapping[str, Bins]) -> None:
     """Warns of fractions in the place of whole numbers, before there has been a reset."""
     for name, given in player.parameters.items():
-        if given.set != "attribute" or not bins[name].low.is_floating_point():
+        if given.set != "attribute" or given.to or not bins[name].low.is_floating_point():
             continue
         for path in given.names(name):
             before = read_attribute(player.unwrapped, path)
@@ -205,14 +206,14 @@ def _check_kinds(player: LevelPlayer, bins: Mapping[str, Bins]) -> None:
                 )
 
 
-def _check_ends(player: LevelPlayer, name: str, ends: list[Play]) -> None:
-    """Sets both ends of a parameter, and checks that they arrive, stay, and change something.
+def _check_values(player: LevelPlayer, name: str, plays: list[Play]) -> None:
+    """Sets a parameter to values, and checks that they arrive, stay, and change something.
 
     A change of the picture suffices, as it may take skill to meet what differs.
     """
     shown = player.observation_space, player.action_space
     episodes: list[list[_Played]] = []
-    for play in ends:
+    for play in plays:
         for seed in range(RESETS):
             player.play = play._replace(seed=play.seed + seed)
             player.reset()
@@ -229,8 +230,10 @@ def _check_ends(player: LevelPlayer, name: str, ends: list[Play]) -> None:
                 f"parameters.{name}: all levels must show and take the same, but "
                 f"{play.values[name]:g} changes {shown} to {now}"
             )
+    ends = plays[0], plays[-1]
     first, last = (play.values[name] for play in ends)
-    if first != last and _same_episodes(*episodes) and _look_alike(player, ends):
+    same = first != last and _same_episodes(episodes[0], episodes[-1])
+    if same and _look_alike(player, ends):
         warnings.warn(
             f"parameters.{name}: {len(episodes[0])} steps with {first:g} and with {last:g} are the "
             "same to the last digit: the environment may not read this parameter",
@@ -238,7 +241,7 @@ def _check_ends(player: LevelPlayer, name: str, ends: list[Play]) -> None:
         )
 
 
-def _look_alike(player: LevelPlayer, ends: list[Play]) -> bool:
+def _look_alike(player: LevelPlayer, ends: Sequence[Play]) -> bool:
     camera = Camera(player.make, player.parameters, ends[0])
     first, last = (camera.picture(play, None) for play in ends)
     return not camera.works or np.array_equal(first, last)

@@ -51,6 +51,33 @@ def test_each_number_gets_where_it_belongs() -> None:
     assert again is not inner and (again.width, again.engine.speed) == (1.0, 1.25)
 
 
+CELLS, MAPS = [[1, 1], [3, 4]], [["SF", "FG"], ["SH", "FG"]]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "way", "name", "to", "found"),
+    [
+        (WALK, "option", "start", [0.5, 2.5], lambda env: env.kept[-1][1]["start"]),
+        (WALK, "option", "cell", CELLS, lambda env: env.kept[-1][1]["cell"]),
+        (WALK, "attribute", "engine.memory", [False, True], lambda env: env.engine.memory),
+        (WALK, "attribute", "kept", CELLS, lambda env: env.kept[:2]),
+        ("FrozenLake-v1", "argument", "desc", MAPS, lambda env: env.desc.astype(str).tolist()),
+    ],
+)
+def test_a_value_may_stand_for_anything(
+    env_id: str, way: Any, name: str, to: list[Any], found: Any
+) -> None:
+    given = ParameterSettings(set=way, name=name, values=[1, 5], to=to, target=5)
+    player = LevelPlayer(MakeEnvironment(env_id), {"a": given}, Play({"a": 5}, 7))
+    for value, thing in ((5, to[1]), (5, to[1]), (1, to[0])):
+        player.play = Play({"a": value}, 7)
+        player.reset()
+        now = found(player.unwrapped)
+        assert now == (thing if name != "desc" else [[*row] for row in thing])
+        if isinstance(now, list):
+            now.append("spoilt")
+
+
 def test_once_it_stands_still_after_an_episode() -> None:
     player = LevelPlayer(MakeEnvironment(WALK), PARAMETERS, Play(LEVEL, 7), once=True)
     for _ in range(2):

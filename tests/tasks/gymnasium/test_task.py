@@ -293,6 +293,21 @@ def test_one_parameter_can_set_several_numbers() -> None:
     assert (inner.engine.speed, inner.wind) == (0.5, 0.5)
 
 
+def test_what_values_stand_for_is_tried_and_distinguishes_measurements() -> None:
+    def parameters(values: list[int], to: Any) -> dict[str, ParameterSettings]:
+        return {"width": ParameterSettings(set="argument", values=values, to=to, target=1)}
+
+    with pytest.raises(ValueError, match=r"to=\[2.0\]: must be one for each of values=\[1, 2\]"):
+        parameters([1, 2], [2.0])
+    with pytest.raises(ValueError, match=r"refuses width=2, seed=\d+: ValueError: width must"):
+        walk_task(parameters=parameters([1, 2, 3], [2.0, -1.0, 1.0]))
+    some, others, none = (
+        walk_task(parameters=parameters([1, 2], to)) for to in ([2.0, 3.0], [3.0, 2.0], None)
+    )
+    assert some.facts["measured"] != others.facts["measured"]
+    assert "to" not in none.facts["measured"]["parameters"]["width"]  # as in runs from before
+
+
 @pytest.mark.parametrize(
     "method",
     ["accel curriculum.edits=2", "plr task.parameters={} task.train_seeds=5",

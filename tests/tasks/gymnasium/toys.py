@@ -49,6 +49,7 @@ NO_BOX2D = pytest.mark.skipif(
 
 class Engine:
     speed = 1.0
+    memory = False
 
 
 class Walk(gymnasium.Env[Any, Any]):
