@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import gc
 import inspect
 import re
 import sys
+from functools import partial
 from importlib import metadata
 from importlib.util import find_spec
 from operator import attrgetter
@@ -23,6 +25,10 @@ from sphinx.errors import ExtensionError
 from sphinx.util import inspect as sphinx_inspect
 
 import proposer_rl  # noqa: F401  names of its modules are looked up in sys.modules
+
+# What is imported and read stays: no need to look for garbage in it again and again.
+gc.freeze()
+gc.set_threshold(50_000, 20, 20)
 
 project = "proposer_rl"
 author = copyright = "proposer_rl contributors"
@@ -44,7 +50,6 @@ nitpick_ignore = [  # stand-ins, see below
     ("py:class", "verl.experimental.dataset.sampler.AbstractCurriculumSampler"),
     ("py:class", "TensorDictBase"),  # of tensordict, in a text alone
 ]
-suppress_warnings = ["ref.python"]  # one name in two modules: an annotation is linked to either
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
@@ -54,6 +59,7 @@ autodoc_default_options = {"members": True, "show-inheritance": True, "ignore-mo
 autodoc_member_order = "bysource"
 autodoc_mock_imports = ["transformers", "verl"]  # which docs do without
 autodoc_typehints_format = "short"
+autodoc_use_type_comments = False  # every function's source would be parsed for them
 maximum_signature_line_length = 88
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
@@ -79,6 +85,7 @@ def setup(app: Sphinx) -> None:
     app.connect("autodoc-process-docstring", prepare, priority=400)  # before napoleon
     app.connect("autodoc-process-signature", shorten)
     app.connect("autodoc-skip-member", skip_foreign)
+    app.connect("doctree-read", forget_suffixes)
     app.connect("missing-reference", resolve)
     app.connect("source-read", unlink)
 
@@ -147,27 +154,32 @@ def skip_foreign(
     return added or None
 
 
+def forget_suffixes(app: Sphinx, doctree: nodes.document) -> None:
+    """Leaves names to :func:`resolve`: Sphinx would search all objects for one that ends so."""
+    for node in doctree.findall(pending_xref):
+        node.attributes.pop("refspecific", None)
+
+
 def resolve(
     app: Sphinx, env: BuildEnvironment, node: pending_xref, text: nodes.Element
 ) -> nodes.Element | None:
     """Links a name to what it means in the module whose docstring or annotation has it.
 
     What another package defines, or what has no docstring of its own, stays text. A name that means
-    nothing is left to Sphinx, which warns.
+    nothing there is that of the one object that ends so; else Sphinx warns.
     """
     target = re.sub(r"^pd\.", "pandas.", node["reftarget"])  # which only type checkers import
     if node["refdomain"] != "py":
         return None
     if not re.fullmatch(r"[\w.]+", target):
         return text  # an annotation that Sphinx could not take apart
+    link = partial(env.domains.python_domain.resolve_xref, env, node["refdoc"], app.builder)
     found = meaning(target, node.get("py:module") or "")
     if found is None:
-        return None
+        node["refspecific"] = True  # the one object that ends so, if there is one
+        return link(node["reftype"], target, node, text)
     defined = f"{getattr(found, '__module__', '')}.{getattr(found, '__qualname__', '')}"
-    linked = env.domains.python_domain.resolve_xref(
-        env, node["refdoc"], app.builder, "obj", defined, node, text
-    )
-    return linked or text
+    return link("obj", defined, node, text) or text
 
 
 def meaning(target: str, module: str) -> Any:

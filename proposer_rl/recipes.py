@@ -10,7 +10,7 @@ import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import reduce
+from functools import cache, reduce
 from inspect import isfunction
 from pathlib import Path
 from typing import Any, Literal
@@ -132,6 +132,7 @@ def as_recipe(argument: str, group: Literal["task", "method"], given: Any) -> Re
     return recipe_function(group, given)()
 
 
+@cache
 def recipe_function(group: Literal["task", "method"], name: str) -> Callable[..., Recipe]:
     """Returns the function ``prl.curricula.NAME`` or ``prl.tasks.NAME``.
 

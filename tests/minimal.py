@@ -8,6 +8,7 @@ commands in forks of itself: each of its lines names an extra, the extra's folde
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import sys
@@ -251,7 +252,7 @@ def _end_with(function: Callable[..., None], *given: Any) -> None:
 
 
 def _main() -> None:
-
+    gc.disable()  # of what is imported nothing is garbage
     # Of the tests' folder nothing else can be imported.
     spec = spec_from_file_location("composing", Path(__file__).with_name("composing.py"))
     assert spec is not None and spec.loader is not None
@@ -260,6 +261,8 @@ def _main() -> None:
     from proposer_rl.cli import run  # noqa: F401  what takes seconds, before the forks
 
     assert "gymnasium" not in sys.modules  # which looks for an extra's environments at once
+    gc.freeze()  # a child that looks for garbage would copy all that memory
+    gc.enable()
     for line in sys.stdin:
         extra, site, folder = json.loads(line)
         child = os.fork()

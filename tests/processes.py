@@ -124,6 +124,7 @@ def python(
 
 
 def serve() -> None:
+    gc.disable()  # of what is imported nothing is garbage
     from proposer_rl.cli import run, shown, train  # noqa: F401  run takes seconds
     from tests import composing
 
@@ -133,6 +134,7 @@ def serve() -> None:
     composing.remember()
     shown.draw_run = lambda folder, title: folder / "run.png"  # a quarter of what a child computes
     gc.freeze()  # a child that looks for garbage would copy all that memory
+    gc.enable()
 
     for line in sys.stdin:
         values = json.loads(line)
