@@ -21,6 +21,7 @@ SHOWN = [
     ("hand_designed", "filtered", "hand-designed, filtered", "#56B4E9"),
     ("first_order_gain", "none", "first-order gain (filtered)", "#AA3377"),
     ("ncc", "none", "NCC", "#009E73"),
+    ("adaptive_mixture", "none", "adaptive mixture (no oracle)", "#332288"),
     ("model_transport", "none", "model transport (no oracle)", "#0072B2"),
     ("perf_gain", "none", "performance gain (the paper's)", "#D55E00"),
     ("domain_randomization", "none", "domain randomization", "#555555"),
