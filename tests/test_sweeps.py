@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import signal
 from functools import partial
@@ -18,6 +19,7 @@ from proposer_rl.experiment import Experiment
 from proposer_rl.recipes import CONFIG_FOLDER, available, file_content
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.runs.process import Interrupted, locked
+from proposer_rl.tasks.gymnasium.player import LevelPlayer
 from tests.commands import SMOKE, call
 
 FEW = [*SMOKE, "schedule.updates=2"]
@@ -41,6 +43,22 @@ def measured(folder: Path, seed: int) -> dict[str, object]:
     samples = read_jsonl(folder / "curriculum.jsonl")
     found["samples"] = [row for row in samples if row["seed"] == seed]
     return found
+
+
+def test_a_finished_run_leaves_no_environments_in_memory(train) -> None:
+    def players() -> list[object]:
+        return [each for each in gc.get_objects() if isinstance(each, LevelPlayer)]
+
+    gc.collect()
+    before = len(players())
+    gc.disable()  # the collector comes by sooner or later, but by then the next run has its own
+    try:
+        small = ["task.evaluation.levels=2", "solver.batch_size=2", "solver.ppo.horizon=8"]
+        few = ["solver.ppo.minibatches=1", "schedule.updates=1", "compute.progress=false"]
+        assert train("-m", "task=cartpole", "+method=target", *small, *few) == 0
+        assert len(players()) == before
+    finally:
+        gc.enable()
 
 
 def test_seeds_side_by_side_give_what_they_give_alone(train) -> None:

@@ -7,6 +7,7 @@ folder, one that fails in a sweep leaves its reason.
 
 from __future__ import annotations
 
+import gc
 import math
 import os
 import shutil
@@ -116,6 +117,11 @@ def _main(hydra_config: DictConfig) -> float:
             _remove_traces()
             refuse(error, path)
         raise
+    finally:
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            # Environments hang in circles and may hold gigabytes that Python does not see, as
+            # MuJoCo's models; those of the next run would come on top.
+            gc.collect()
 
 
 def _refuse_pickles(arguments: list[str]) -> None:
