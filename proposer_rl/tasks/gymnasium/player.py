@@ -214,8 +214,8 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             self._seen, self.last_info = self.env.reset(
                 seed=self._play.seed, **({"options": given} if given else {})
             )
-        except UnfitEnvironmentError:
-            raise
+        except UnfitEnvironmentError as error:
+            raise UnfitEnvironmentError(f"{error}, on the level {self._play}") from error
         except Exception as error:
             raise self._refused(error) from error
         return self._seen, {}
@@ -224,18 +224,21 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Takes a step, unless the episode of an evaluation is over."""
         if self._still:
             return self._seen, 0.0, False, False, {}
+        rule = self._success
         try:
             answer = stepped(self.env.step(action))
+            self._seen, reward, terminated, truncated, self.last_info = answer
+            self._return += reward
+            over = terminated or truncated
+            if rule is not None and (over or rule.once):
+                step = Step(terminated, truncated, self.in_time, self._return, self.last_info)
+                self._succeeded = rule(step) or self._succeeded
+            if rule is not None and over:
+                rule.check_info(self.last_info)
         except Exception as error:  # whatever an environment of somebody's may raise
             unfit = isinstance(error, UnfitEnvironmentError)
             said = str(error) if unfit else f"step raises {cause(error)}"
             raise UnfitEnvironmentError(f"{said}, on the level {self._play}") from error
-        self._seen, reward, terminated, truncated, self.last_info = answer
-        self._return += reward
-        over, rule = terminated or truncated, self._success
-        if rule is not None and (over or rule.once):
-            step = Step(terminated, truncated, self.in_time, self._return, self.last_info)
-            self._succeeded = rule(step) or self._succeeded
         info = {"success": True} if over and self._succeeded else {}
         return self._seen, reward, terminated, truncated, info
 

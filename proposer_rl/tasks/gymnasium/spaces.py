@@ -41,9 +41,7 @@ def plain_env(env: Env) -> Env:
 def _with_plain_observations(env: Env) -> Env:
     space = env.observation_space
     if isinstance(space, spaces.Box) and len(space.shape) == (3 if is_image(space) else 1):
-        # Any numbers are floats to a vector environment, which keeps whole ones only of their type.
-        whole = space.dtype.kind in "biu"
-        return TransformObservation(env, partial(_typed, space), space) if whole else env
+        return TransformObservation(env, partial(_typed, space), space)
     parts: dict[str, spaces.Space[Any]] = {}
     for name, part in leaves(space):
         while name in parts:  # a.b is a name with a dot, or b in a
@@ -70,11 +68,9 @@ def _with_plain_observations(env: Env) -> Env:
         new[NUMBERS_ENTRY] = spaces.flatten_space(rest)
 
     def changed(seen: Any) -> Any:
-        shown = dict(zip(parts, _in_order(space, seen), strict=True))
-        out: dict[str, Any] = {
-            f"image {name}": _of_three_axes(_typed(box, shown[name]))
-            for name, box in images.items()
-        }
+        read = zip(parts.items(), _in_order(space, seen), strict=True)
+        shown = {name: _typed(part, own) for (name, part), own in read}
+        out: dict[str, Any] = {f"image {name}": _of_three_axes(shown[name]) for name in images}
         if rest.spaces:
             out[NUMBERS_ENTRY] = spaces.flatten(rest, {name: shown[name] for name in rest.spaces})
         return out if len(out) > 1 else next(iter(out.values()))
@@ -83,15 +79,18 @@ def _with_plain_observations(env: Env) -> Env:
     return TransformObservation(env, changed, together)
 
 
-def _typed(space: spaces.Box, seen: Any) -> Array:
-    """Returns an observation in the type of its box.
+def _typed(space: spaces.Space[Any], seen: Any) -> Array:
+    """Returns an observation in the type of its space, of numbers.
 
     Raises:
-        UnfitEnvironmentError: where a whole number would become another.
+        UnfitEnvironmentError: where it has another shape, or a whole number would become another.
     """
     array = np.asarray(seen)
-    if array.dtype != space.dtype and space.dtype.kind in "biu":
-        check_seen(space, array, "the environment")
+    # Floats of a box are not looked at one by one: that would take longer than many a step.
+    floats = array.dtype.kind == "f" == space.dtype.kind
+    plain = isinstance(space, spaces.Box) and (floats or array.dtype == space.dtype)
+    if not plain or array.shape != space.shape:
+        check_seen(space, seen, "the environment")
     return array.astype(space.dtype, copy=False)
 
 

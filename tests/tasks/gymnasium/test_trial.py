@@ -365,12 +365,44 @@ def test_whole_numbers_of_another_type_are_seen_as_they_are(space: Any, seen: An
         assert np.array_equal(state[name][1].numpy().squeeze(), part)
 
 
-def test_what_a_type_cannot_hold_is_also_refused_after_the_trial() -> None:
-    shown = odd(**shows(np.array([1, 2]), BYTES))
+CHOICE, CHOICES, BITS = spaces.Discrete(5), spaces.MultiDiscrete([5, 5]), spaces.MultiBinary(2)
+BOXED = spaces.Dict({"a": spaces.Box(-1, 1, (2,)), "b": CHOICE})
+LATER: list[tuple[Any, Any, Any, str]] = [
+    (BYTES, np.array([1, 2]), np.array([1, 256]), r"\[ 1 256\] of int64, which uint8 cannot"),
+    (Line.observation_space, np.ones(2), np.ones(3), r"shape \[3\] instead of \[2\]"),
+    (Line.observation_space, np.ones(2), None, r"shape \[\] instead of \[2\]"),
+    (Line.observation_space, np.ones(2), ["a", "b"], "which are no numbers"),
+    (CHOICE, 1, -1, r"shows -1; its observation space is Discrete\(5\)"),
+    (CHOICES, np.array([1, 2]), np.array([1, -2]), r"shows \[ 1 -2\]; its"),
+    (BITS, np.array([0, 1]), np.array([0, 2]), r"shows \[0 2\]; its"),
+    (BITS, np.array([0, 1]), np.array([0, 256]), "which int8 cannot hold"),
+    (BOXED, {"a": np.ones(2), "b": 1}, {"a": np.ones(3), "b": 1}, r"shape \[3\] instead of \[2\]"),
+]
+
+
+@pytest.mark.parametrize(("space", "first", "later", "message"), LATER)
+def test_what_a_space_cannot_hold_is_also_refused_after_the_trial(
+    space: Any, first: Any, later: Any, message: str
+) -> None:
+    shown = odd(**shows(first, space))
     player = LevelPlayer(MakeEnvironment(shown), GOAL, Play({"goal": 3.0}, 0))
     player.reset()
-    player.unwrapped.seen = lambda: np.array([1, 256])  # type: ignore[attr-defined]
-    with pytest.raises(UnfitEnvironmentError, match=r"\[ 1 256\] of int64, which uint8 cannot"):
+    player.unwrapped.seen = lambda: later  # type: ignore[attr-defined]
+    for act in (player.reset, lambda: player.step(0)):
+        with pytest.raises(UnfitEnvironmentError, match=f"{message}.*, on the level goal=3, seed"):
+            act()
+
+
+@pytest.mark.parametrize("info", [{}, {"is_success": None}])
+def test_an_end_that_does_not_tell_success_is_refused_after_the_trial_too(info: Any) -> None:
+    tells = {"is_success": False}
+    ends = odd(step=lambda self, a: (self.seen(), 0.0, True, False, self.told), told=tells)
+    player = LevelPlayer(MakeEnvironment(ends), GOAL, Play({"goal": 3.0}, 0), TOLD)
+    player.reset()
+    player.step(0)
+    player.unwrapped.told = info  # type: ignore[attr-defined]
+    player.reset()
+    with pytest.raises(UnfitEnvironmentError, match=r"success.key=is_success: .* level goal=3"):
         player.step(0)
 
 
