@@ -22,7 +22,8 @@ from proposer_rl.runs.folder import is_rate, read_bounded
 
 PICTURE_BYTES = PICTURE_PIXELS = 2**20
 LARGEST = 1e100  # what is greater is no measurement, and overflows when it is drawn
-LONGEST_TEXT = 400
+LONGEST_TEXT, LONGEST_NAME = 400, 80
+MOST_AXES = 64  # that an array may have
 
 # Total gains of replicas, by their name in the records of cycles; the first that is there is shown.
 GAINS = {"log_success_gain": "log success", "return_gain": "return"}
@@ -45,7 +46,7 @@ def _one_line(text: str) -> str:
     return text
 
 
-Name = Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_one_line)]
+Name = Annotated[str, Field(min_length=1, max_length=LONGEST_NAME), AfterValidator(_one_line)]
 Text = Annotated[str, Field(max_length=LONGEST_TEXT), AfterValidator(_one_line)]
 
 
@@ -99,7 +100,7 @@ class TaskFacts(BaseModel):
     distributions: Annotated[list[Name], Field(min_length=1)]
     space: Annotated[
         dict[Name, Annotated[list[FiniteFloat], Field(min_length=1, max_length=256)]],
-        Field(max_length=16),
+        Field(max_length=MOST_AXES),
     ] = {}
     about: dict[Name, Text] = {}
     measured: Any
@@ -136,6 +137,11 @@ def small_json(path: Path, largest: int = 2**20) -> Any:
 def printable(text: str) -> str:
     """Returns a text as one line without control characters."""
     return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+
+
+def shortened(text: str, longest: int) -> str:
+    """Returns a text as it is, or where it is longer its beginning and dots."""
+    return text if len(text) <= longest else f"{text[: longest - 3]}..."
 
 
 def encoded(text: str) -> bytes:

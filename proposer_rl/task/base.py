@@ -29,7 +29,14 @@ from proposer_rl.learning import (
     mean_performance,
 )
 from proposer_rl.models import ActorCritic, Population, distribution_of, memory_actor_critic, normal
-from proposer_rl.runs.records import pixels, png, written
+from proposer_rl.runs.records import (
+    LONGEST_NAME,
+    LONGEST_TEXT,
+    pixels,
+    png,
+    shortened,
+    written,
+)
 from proposer_rl.streams import Streams
 from proposer_rl.task.protocols import (
     ComputeContext,
@@ -379,11 +386,11 @@ class Task(ABC):
         - ``samples``: records (see :meth:`record`) of levels of each distribution measured on.
         """
         return {
-            "title": self.title,
+            "title": shortened(self.title, LONGEST_NAME),
             "levels": self.noun,
             "distributions": list(self.evaluated_on),
             "space": {name: list(values) for name, values in self.space.axes.items()},
-            "about": self.about,
+            "about": {key: shortened(said, LONGEST_TEXT) for key, said in self.about.items()},
             "key": self.key,
             **({"text_key": self.text_key} if self.text_key else {}),
             "measured": self._measured,

@@ -19,6 +19,7 @@ from PIL import Image
 from proposer_rl.cli.build import make_task
 from proposer_rl.extras import install_command
 from proposer_rl.runs.folder import read_csv
+from proposer_rl.runs.records import TaskFacts, checked
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium import batched_env, pictures
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings
@@ -291,6 +292,20 @@ def test_one_parameter_can_set_several_numbers() -> None:
     player.reset()
     inner: Any = player.unwrapped
     assert (inner.engine.speed, inner.wind) == (0.5, 0.5)
+
+
+@pytest.mark.filterwarnings("ignore:parameters")  # none of the options is read
+def test_many_parameters_and_values_are_described_in_short() -> None:
+    one = ParameterSettings(set="option", low=0.125, high=0.375, target=[0.1875, 0.3125])
+    many = ParameterSettings(set="option", values=list(range(200)), target=list(range(150)))
+    gymnasium.register(name := f"{'Long' * 30}-v0", Line, max_episode_steps=6)
+    task = walk_task(
+        env_id=name, parameters={f"number {i}": one for i in range(17)} | {"track": many}
+    )
+    told = checked(TaskFacts, task.facts, "task")
+    assert len(told.space) == 18 and len(told.space["track"]) == 200
+    assert told.about["Target"].startswith("number 0 0.1875 to 0.3125; number 1 0.1875 to")
+    assert told.about["Target"].endswith("...") and told.title == f"{'Long' * 20}"[:77] + "..."
 
 
 def test_what_values_stand_for_is_tried_and_distinguishes_measurements() -> None:
