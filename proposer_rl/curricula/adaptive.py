@@ -31,7 +31,6 @@ tried again.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any
@@ -105,7 +104,7 @@ class AdaptiveMixture(Curriculum):
         times: candidates for each level of the way.
     """
 
-    remembers = ("_inbox", "_sums", "_best", "_ends", "_number", "_told")
+    remembers = ("_inbox", "_sums", "_best", "_ends", "_number", "_told", "_seen", "_shown")
 
     @checked
     def __init__(
@@ -132,8 +131,8 @@ class AdaptiveMixture(Curriculum):
         self._told = False  # whether success is told
         self._last: dict[str, Levels] = {}  # on the way, of each student [m]
         # What was predicted, and what it was [K, m]; loops may go on for ever without a log.
-        self._seen: deque[tuple[Tensor, Tensor]] = deque(maxlen=LOGGED)
-        self._proposed: tuple[Levels, Tensor] | None = None  # the last levels [n], and their arms
+        self._seen: list[tuple[Tensor, Tensor]] = []
+        self._some: dict[str, Levels] = {}  # of the last levels, by their arms
         self._shown: dict[str, Any] = {}
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
@@ -146,7 +145,7 @@ class AdaptiveMixture(Curriculum):
         inputs, items = self._inputs(levels), self._items(levels)
         rows = zip(self._beliefs, inputs, _each(items, len(inputs)), strict=True)
         predicted = torch.stack([belief.predict(x, which) for belief, x, which in rows])
-        self._proposed = levels[0], arms[0]
+        self._some = some_of_each(levels[0], arms[0])
         notes = {"arm": arms, "inputs": inputs, "predicted": predicted}
         return self._inbox.batch(levels, **notes, **({} if items is None else {"items": items}))
 
@@ -170,9 +169,8 @@ class AdaptiveMixture(Curriculum):
         :func:`~proposer_rl.curricula.outcome_model.calibration`.
         """
         shown, self._shown = self._shown, {}
-        if self._proposed is not None:
-            shown["levels"] = some_of_each(*self._proposed)
-            self._proposed = None
+        if self._some:
+            shown["levels"], self._some = self._some, {}
         if self._seen:
             predicted, success = (torch.cat(one, 1) for one in zip(*self._seen, strict=True))
             shown |= calibration(predicted, success)
@@ -180,10 +178,12 @@ class AdaptiveMixture(Curriculum):
         return shown
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns also the belief, and the last levels of the way."""
+        """Returns also the belief, the last levels of the way, and some of each arm."""
         beliefs = [belief.state_dict() for belief in self._beliefs]
-        last = {student: packed(levels) for student, levels in self._last.items()}
-        return {**super().state_dict(), "beliefs": beliefs, "last": last}
+        last, some = (
+            {name: packed(levels) for name, levels in of.items()} for of in (self._last, self._some)
+        )
+        return {**super().state_dict(), "beliefs": beliefs, "last": last, "some": some}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Puts back what :meth:`state_dict` returned."""
@@ -193,7 +193,10 @@ class AdaptiveMixture(Curriculum):
             belief.load_state_dict(own)
         super().load_state_dict(state)
         like = type(self._space.sample(1, torch.Generator()))
-        self._last = {k: like.from_dict(one, batch_dims=1) for k, one in state["last"].items()}
+        self._last, self._some = (
+            {name: like.from_dict(one, batch_dims=1) for name, one in state[key].items()}
+            for key in ("last", "some")
+        )
 
     def _begin(self, students: int) -> None:
         if self._beliefs:
@@ -221,7 +224,7 @@ class AdaptiveMixture(Curriculum):
             for belief, x, label, own, count in every:
                 belief.grow_older(batches)
                 belief.observe(x, label, own, count)
-            self._seen.append((seen["predicted"], success))
+            self._seen = [*self._seen[1 - LOGGED :], (seen["predicted"], success)]
             of = {
                 "levels": torch.ones_like(labels),
                 "successes": success,

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 import warnings
 from abc import abstractmethod
-from collections import deque
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -45,14 +44,14 @@ class ItemCurriculum(Curriculum):
     """
 
     reads = ("success",)
-    remembers: ClassVar[tuple[str, ...]] = ("_inbox", "numbers")
+    remembers: ClassVar[tuple[str, ...]] = ("_inbox", "numbers", "_seen")
 
     def __init__(self, space: Space) -> None:
         refuse_unfit_bins(space)
         self.space = space
         self.numbers: dict[str, Tensor] = {}  # each [K, ...]; none before the first proposal
         self._inbox = Inbox()
-        self._seen: deque[tuple[Tensor, Tensor]] = deque(maxlen=LOGGED)
+        self._seen: list[tuple[Tensor, Tensor]] = []  # what was predicted, and what it was
 
     @abstractmethod
     def first_numbers(self, students: int) -> dict[str, Tensor]:
@@ -120,7 +119,8 @@ class ItemCurriculum(Curriculum):
                 seen = {name: came[name][k] for name in ("item", "success", "count")}
                 self.learn(self._own(k), seen)
             if "predicted" in came.keys():
-                self._seen.append((came["predicted"], came["success"]))
+                new = came["predicted"], came["success"]
+                self._seen = [*self._seen[1 - LOGGED :], new]
 
     def _own(self, k: int) -> dict[str, Tensor]:
         """Returns views of the numbers of a student."""

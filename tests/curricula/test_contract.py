@@ -88,6 +88,25 @@ def test_restored_from_a_file_it_goes_on_as_if_nothing_had_happened(name: str) -
     assert same(again[0].state_dict(), whole[0].state_dict())
 
 
+LOGGING = ["plr", "progress of episodes", "adaptive_mixture", "transport on a model"]
+
+
+@pytest.mark.parametrize("name", LOGGING)
+def test_a_log_is_of_all_since_the_last_one_also_where_it_is_restored_in_between(name: str) -> None:
+    whole, learner = resumed(name, shared())
+    student = TaskStudent(TASK, learner)
+    for number in range(2):
+        batch = whole.propose(student, P, [Streams(0, "log", number)])
+        whole.observe(student, batch, played(student, batch, number))
+    again = MADE[name]()
+    again.load_state_dict(whole.state_dict())
+    expected, found = (curriculum.log() for curriculum in (whole, again))
+    levels, others = (log.pop("levels", {}) for log in (expected, found))
+    assert expected == found and len(levels) == len(others)
+    if name == "adaptive_mixture":
+        assert all((levels[arm] == others[arm]).all() for arm in levels)
+
+
 ALONE = [name for name in REMEMBER if name in MADE and name not in ("robust", "mixed")]
 
 

@@ -155,7 +155,10 @@ def test_one_drift_moves_the_items_that_nobody_draws() -> None:
     assert float(curriculum.numbers["drift"]) == pytest.approx(0.006, abs=0.002)
     expected = 0.2 + 0.006 * 149 + 0.01 * (torch.arange(40) % 5).double()
     assert (curriculum.numbers["psi"][0] - expected).abs().max() < 0.08
-    assert "brier" in curriculum.log()
+    again = made("arc_length", prl.Items(40))
+    again.load_state_dict(curriculum.state_dict())
+    logged = curriculum.log()
+    assert "brier" in logged and again.log() == logged
 
 
 @pytest.mark.parametrize("answers", [1, 2, 5])
