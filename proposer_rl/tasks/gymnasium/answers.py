@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
@@ -12,6 +13,7 @@ from gymnasium import spaces
 from proposer_rl.settings import settings
 from proposer_rl.tasks.parameters import LARGEST
 
+ROUNDING = 1e-6  # of a sum of rewards, as a share of it: ten times 0.1 is 0.9999999999999999
 # Spaces whose values are one number or an array of them.
 NUMERIC = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
 
@@ -171,7 +173,8 @@ class SuccessSettings:
             UnfitEnvironmentError: if its info says it in something else than a truth value.
         """
         if self.kind == "return":
-            return step.returns >= (self.least or 0.0)
+            least = self.least or 0.0
+            return step.returns >= least or math.isclose(step.returns, least, rel_tol=ROUNDING)
         if self.kind == "survived":
             return not step.terminated and not step.in_time
         if self.kind == "terminated":

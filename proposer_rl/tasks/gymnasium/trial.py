@@ -15,7 +15,12 @@ from gymnasium.utils.passive_env_checker import check_action_space, check_observ
 
 from proposer_rl.models import callers_state
 from proposer_rl.task import named
-from proposer_rl.tasks.gymnasium.answers import SuccessSettings, UnfitEnvironmentError, check_seen
+from proposer_rl.tasks.gymnasium.answers import (
+    ROUNDING,
+    SuccessSettings,
+    UnfitEnvironmentError,
+    check_seen,
+)
 from proposer_rl.tasks.gymnasium.attributes import read_attribute
 from proposer_rl.tasks.gymnasium.pictures import Camera
 from proposer_rl.tasks.gymnasium.player import (
@@ -182,7 +187,8 @@ def _check_reachable(player: LevelPlayer, least: float, rewards: list[float], li
             f"{highest:g}, and an episode after {limit} steps"
         )
     reward = rewards[0]
-    if reward > 0 and min(rewards) == max(rewards) and least > reward * limit:
+    most = reward * limit * (1 + ROUNDING)
+    if reward > 0 and min(rewards) == max(rewards) and least > most:
         warnings.warn(
             f"success.least={least:g}: can it be reached? Each step of an episode had a reward of "
             f"{reward:g}, and there are {limit} steps at most",
