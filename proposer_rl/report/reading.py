@@ -260,7 +260,11 @@ def _optional(folder: Path, name: str, read: Any) -> list[Any]:
 def _read_json(folder: Path, name: str) -> dict[str, Any] | None:
     if not (folder / name).exists():
         return None
-    value = json.loads(_checked(folder, name).read_text(encoding="utf-8"))
+    content = _checked(folder, name).read_bytes()
+    try:
+        value = json.loads(content)
+    except ValueError as error:
+        raise ValueError(f"{name} is no JSON: {error}") from None
     if not isinstance(value, dict):
         raise ValueError(f"{name} is not a JSON object")
     return value

@@ -255,7 +255,11 @@ def _lines(path: Path) -> Iterator[tuple[str, str]]:
     with open(path, "rb") as file:
         for number, line in enumerate(file, 1):
             if line.endswith(b"\n"):
-                yield f"{path}, line {number}", line[:-1].decode()
+                place = f"{path}, line {number}"
+                try:
+                    yield place, line[:-1].decode()
+                except UnicodeDecodeError as error:
+                    raise ValueError(f"{place}: {error}") from None
 
 
 def _first_line(path: Path) -> str | None:

@@ -124,7 +124,8 @@ def in_cycle(value: object):
     [
         ("config.json", lambda text: "[]", "not a JSON object"),
         ("config.json", lambda text: "[" * 100_000, "recursion"),
-        ("config.json", lambda text: text[:-5], "Unterminated"),
+        ("config.json", lambda text: text[:-5], "config.json is no JSON: Unterminated"),
+        ("run.json", lambda text: "{", "run.json is no JSON: Expecting"),
         ("config.json", set_key("schedule", value={}), "'headline' is missing"),
         ("config.json", lambda text: text.replace('"method"', '"m"'), "'method' is missing"),
         ("config.json", set_key("method", value="x" * 1000), "method: String should have at most"),
@@ -171,8 +172,8 @@ def in_cycle(value: object):
         ("run.json", set_key("task", "space", value={"a": [0] * 257}), "at most 256 items"),
         (
             "run.json",
-            set_key("task", "space", value={key: [0] for key in "abcdefghijklmnopq"}),
-            "at most 16 items",
+            set_key("task", "space", value={str(key): [0] for key in range(65)}),
+            "at most 64 items",
         ),
         ("run.json", set_key("task", "about", value={"a": "b\nc"}), "about.a: Value error"),
         ("run.json", set_key("task", "samples", value={"id": [1]}), "samples.id.0: Input"),
@@ -244,6 +245,14 @@ def test_a_curriculum_tells_of_levels_in_the_last_cycle_that_has_any(tmp_path: P
     ]
     assert run.sheets["best"][0].picture == LEVEL["picture"]
     assert not any("levels" in row for row in run.cycles)
+
+
+@pytest.mark.parametrize("name", ["config.json", "metrics.csv", "cycles.jsonl"])
+def test_a_file_of_other_bytes_than_text_is_named(name: str, tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", cycles=[cycle(0, [0.1, 0.1], [[1], [1]])])
+    (folder / name).write_bytes((folder / name).read_bytes()[:9] + b"\xff\n")
+    with pytest.raises(UnreadableRun, match=f"{name}.*: 'utf-8' codec"):
+        read_run(folder)
 
 
 def test_files_outside_of_the_folder_are_not_read(tmp_path: Path) -> None:

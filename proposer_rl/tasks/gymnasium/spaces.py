@@ -79,7 +79,7 @@ def _with_plain_observations(env: Env) -> Env:
     return TransformObservation(env, changed, together)
 
 
-def _typed(space: spaces.Space[Any], seen: Any) -> Array:
+def _typed(space: Any, seen: Any) -> Array:
     """Returns an observation in the type of its space, of numbers.
 
     Raises:
@@ -91,7 +91,8 @@ def _typed(space: spaces.Space[Any], seen: Any) -> Array:
     plain = isinstance(space, spaces.Box) and (floats or array.dtype == space.dtype)
     if not plain or array.shape != space.shape:
         check_seen(space, seen, "the environment")
-    return array.astype(space.dtype, copy=False)
+    typed: Array = array.astype(space.dtype, copy=False)
+    return typed
 
 
 def is_image(space: spaces.Space[Any]) -> bool:
