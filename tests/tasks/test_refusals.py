@@ -39,7 +39,7 @@ task:
 {WIDTH}  success: {{kind: terminated}}
 """
 WHOLE = FIRST + FILE
-AXES = "".join(f"    p{i}: {{set: option, values: [0], target: 0}}\n" for i in range(17))
+AXES = "".join(f"    p{i}: {{set: option, values: [0], target: 0}}\n" for i in range(64))
 PARAMETERS = "  parameters:\n"
 MISREAD = [
     (FILE.encode(), "line.yaml must be '# @package _global_'"),
@@ -61,7 +61,7 @@ MISREAD = [
      "task/line: a list where there must be a mapping, {NAME: VALUE} (it has lists in "
      "task.parameters)"),
     (WHOLE.replace(PARAMETERS, PARAMETERS + AXES).encode(),
-     "task: space: Dictionary should have at most 16 items"),
+     "task: space: Dictionary should have at most 64 items"),
     *((WHOLE.replace("width:", f"{name}:").encode(),
        f"task.parameters: {read} without quotes is no name here; a name has quotes")
       for name, read in (
