@@ -130,6 +130,20 @@ def test_an_episode_is_put_together_from_whichever_rows_it_is_in(how: str) -> No
         assert rollout["is_step"].sum() == steps
 
 
+def test_teachers_follow_one_another_on_one_environment() -> None:
+    """Python gives the ids of teachers that are gone to later ones."""
+    base, known = LevelsEnv(), set[int]()
+    for _ in range(100):
+        teacher = counted()
+        again = id(teacher) in known
+        known.add(id(teacher))
+        TransformedEnv(base, prl.LevelTransform(teacher, set_level)).rollout(1)
+        assert teacher.log()["dropped"] == 0
+        if again:
+            return
+        del teacher
+
+
 def test_rollouts_may_be_cut_by_a_transform_behind_it() -> None:
     """Every call resets all environments, also those whose episodes have been observed."""
     teacher = counted("rollout", "success", block=3)
