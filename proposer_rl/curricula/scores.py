@@ -193,7 +193,8 @@ class Scorer:
         self.rollouts, self.from_episodes = rollouts, source == "episodes"
         self._warned = False
         self._own = _own_score(score)
-        self._name = name = score if isinstance(score, str) else score.__qualname__
+        own = getattr(score, "__qualname__", type(score).__name__)
+        self._name = name = score if isinstance(score, str) else own
         available = [*STEPWISE, *READS, "regret"] if self.from_episodes else [*EXACT]
         if self._own is None and name not in available:
             more = ", and functions of your own, as my_module.my_score" * self.from_episodes
