@@ -52,7 +52,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.contract import outcome_of
-from proposer_rl.curricula.student import VALUE, Student, advantages
+from proposer_rl.curricula.student import Student, advantages, values
 from proposer_rl.learning import succeeded
 from proposer_rl.settings import ArgumentError, Count, checked
 from proposer_rl.streams import Streams
@@ -75,7 +75,7 @@ AT_ONCE = 1024  # levels of each Solver that are evaluated at once
 STEPWISE: dict[str, Callable[[Student, TensorDictBase, Tensor], Tensor]] = {
     "positive_value_loss": lambda student, rollout, _: advantages(student, rollout).clamp_min(0),
     "l1_value_loss": lambda student, rollout, _: advantages(student, rollout).abs(),
-    "max_mc": lambda _, rollout, best: best.unsqueeze(-1) - rollout[VALUE].squeeze(-1).double(),
+    "max_mc": lambda _, rollout, best: best.unsqueeze(-1) - values(rollout).squeeze(-1).double(),
 }
 """Scores of every single step of a rollout [K, P, T], float64 and of that shape.
 

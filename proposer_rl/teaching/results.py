@@ -86,10 +86,13 @@ def as_array(
         ArgumentError: naming the argument, if it has another shape or a number that is not finite
             in float32, or not allowed.
     """
-    if isinstance(value, Tensor):
+    if isinstance(value, Tensor) and not value.is_complex():
         value = value.detach().cpu().double()  # NumPy has no bfloat16
     try:
-        array = np.asarray(value, dtype=np.float64)
+        array = np.asarray(value)
+        if array.dtype.kind not in "biufO":  # such as complex numbers and texts
+            raise TypeError(array.dtype)
+        array = array.astype(np.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         # RuntimeError: tensors with a gradient; OverflowError: an integer beyond float64.
         raise ArgumentError(f"{name}={shown(value)}: must be numbers of float32") from error
