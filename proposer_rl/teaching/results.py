@@ -202,8 +202,11 @@ def ended(
         be kept for the next rollout.
 
     Raises:
-        ArgumentError: if it does not say which levels it is of.
+        ArgumentError: if it does not say which levels it is of, or has no reward or done.
     """
+    for name in ("reward", "done"):
+        if name not in rollout["next"].keys():
+            raise ArgumentError(f"rollout: has no {name} in next, one number for each environment")
     if LEVEL_ID not in rollout.keys():
         raise ArgumentError(
             "rollout: has no level_id, so that nothing shows on which levels its episodes "

@@ -582,6 +582,15 @@ def test_a_rollout_without_success_is_refused_where_termination_may_be_failure()
     )
 
 
+@pytest.mark.parametrize("name", ["reward", "done"])
+def test_a_rollout_of_several_agents_is_refused(name: str) -> None:
+    after = TensorDict({"reward": torch.ones(2, 1), "done": torch.ones(2, 1)}, [2])
+    rollout = TensorDict({"level_id": torch.zeros(2, 1), "next": {"agents": after}}, [2])
+    rollout["next"].update(after.exclude(name))
+    with pytest.raises(ArgumentError, match=f"^rollout: has no {name} in next"):
+        plr().observe(rollout)
+
+
 @pytest.mark.parametrize("score", ["l1_value_loss", "max_mc"])
 def test_a_rollout_without_values_is_refused_where_they_are_read(score: str) -> None:
     ends = torch.ones(1, 1, 1, dtype=torch.bool)
