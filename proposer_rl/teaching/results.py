@@ -213,7 +213,7 @@ def ended(
             "began; put LevelTransform around the environment, or give outcome_of(rollout) "
             "where each row begins with a reset on its level"
         )
-    steps: Any = rollout.flatten()
+    steps: Any = rollout.contiguous().flatten()  # also where it is stacked lazily
     if MASK in rollout.keys(True):  # rows are filled up to one length
         steps = steps[rollout[MASK].reshape(-1)]
     if kept is not None:

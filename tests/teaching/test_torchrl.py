@@ -10,7 +10,7 @@ import gymnasium
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from tensordict import TensorDict
+from tensordict import TensorDict, lazy_stack
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.utils import split_trajectories
 from torchrl.data import Composite, Unbounded
@@ -101,7 +101,7 @@ def test_rollouts_say_themselves_which_levels_they_are_of(afresh: bool) -> None:
         ]
 
 
-@pytest.mark.parametrize("how", ["alternating", "one after another", "split"])
+@pytest.mark.parametrize("how", ["alternating", "one after another", "split", "lazy"])
 def test_an_episode_is_put_together_from_whichever_rows_it_is_in(how: str) -> None:
     """As of several workers that come by turns, or whose time is one line; or of trajectories."""
     teacher = counted("rollout", "success", block=3)
@@ -118,6 +118,8 @@ def test_an_episode_is_put_together_from_whichever_rows_it_is_in(how: str) -> No
         rollouts = [worker.rollout().clone() for worker in workers]
         if how == "split":
             rollouts = [split_trajectories(rollout) for rollout in rollouts]
+        if how == "lazy":
+            rollouts = [lazy_stack([*rollout.unbind(0)]) for rollout in rollouts]
         for rollout in [torch.cat(rollouts, 1)] if how == "one after another" else rollouts:
             teacher.observe(rollout)
     for worker in workers:
