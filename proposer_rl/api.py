@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +39,7 @@ from proposer_rl.models import (
     UNet,
 )
 from proposer_rl.recipes import DEFAULT_METHOD, Recipe, as_recipe, filter_content, override
-from proposer_rl.settings import ArgumentError
+from proposer_rl.settings import ArgumentError, shown
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.mazes import Level, LevelSpec, MazeEnv, generate_levels, shortest_path_length
@@ -219,6 +220,15 @@ def train(
     """
     from proposer_rl.cli.compose import compose_and_run
 
+    given: dict[str, tuple[Any, Any, str]] = {
+        "scale": (scale, str, "a name"),
+        "filter": (filter, str | Mapping, "a name, settings"),
+        "folder": (folder, str | PathLike, "a path"),
+        "settings": (settings, Mapping, "a mapping"),
+    }
+    for name, (value, kind, allowed) in given.items():
+        if not (value is None or isinstance(value, kind)):
+            raise ArgumentError(f"{name}={shown(value)}: must be {allowed} or None")
     task = as_recipe("task", "task", task)
     curriculum = as_recipe("curriculum", "method", curriculum)
     overrides = [*task.overrides(), *curriculum.overrides()]
@@ -226,8 +236,8 @@ def train(
         overrides.append(f"+scale={scale}")
     if isinstance(filter, str):
         overrides.append(f"+filter={filter}")
-    given = {**(filter_content(filter) if isinstance(filter, Mapping) else {}), **(settings or {})}
-    overrides += [override(f"++{name}", value) for name, value in given.items()]
+    more = {**(filter_content(filter) if isinstance(filter, Mapping) else {}), **(settings or {})}
+    overrides += [override(f"++{name}", value) for name, value in more.items()]
     overrides += [override("seed", seed), override("compute.progress", progress)]
     if updates is not None:
         overrides.append(override("schedule.updates", updates))

@@ -95,6 +95,8 @@ def own_recipe(
     Raises:
         ArgumentError: if it cannot be imported by its name.
     """
+    if not (inspect.isclass(make) or isfunction(make)):
+        raise _refusal(f"make={make!r:.60}: must be a class or a function")
     return Recipe(group, make.__name__, settings, _dotted("make", make))
 
 
@@ -125,7 +127,7 @@ def as_recipe(argument: str, group: Literal["task", "method"], given: Any) -> Re
     Raises:
         ArgumentError: naming the argument, if it is neither.
     """
-    if isinstance(given, Recipe):
+    if isinstance(given, Recipe) and given.group == group:
         return given
     if not isinstance(given, str) or given not in available(group):
         raise _refusal(f"{argument}={given!r}: must be {HOW[group]} {', '.join(available(group))}")

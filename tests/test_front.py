@@ -6,6 +6,7 @@ import inspect
 import json
 import re
 from datetime import datetime
+from functools import partial
 from io import BytesIO, TextIOWrapper
 from pathlib import Path
 from types import MappingProxyType
@@ -230,11 +231,14 @@ def test_a_score_of_ones_own_in_a_run_and_in_a_teacher(tmp_path: Path) -> None:
     mean = float(1 - levels["gravity"].mean())
     assert teacher.log()["mean_score"] == pytest.approx([mean])
     assert teacher.state_dict()["of"]["curriculum"]["score"] == "shortfall"
+    prl.Teacher(prl.curricula.plr(score=partial(shortfall)), teacher.space).ask()  # has no name
 
 
 def test_what_cannot_be_imported_again_is_refused(tmp_path: Path) -> None:
     with pytest.raises(prl.ArgumentError, match="must be importable"):
         own_recipe("method", lambda parts: None)
+    with pytest.raises(prl.ArgumentError, match="must be a class or a function"):
+        prl.curricula.own(prl.Curriculum())
     curriculum = prl.curricula.plr(score=lambda student, outcome: outcome["return"])
     with pytest.raises(prl.ArgumentError, match=r"^curriculum\.score=.*: must be importable"):
         prl.train("maze", curriculum, folder=tmp_path / "run", **SMOKE)
@@ -278,6 +282,12 @@ def test_bad_input_is_one_line_and_leaves_nothing(
         ),
         (prl.tasks.maze, {}, "task=<function .*: must be prl.tasks.NAME"),
         ("cartpole", {"curriculum": 3}, "curriculum=3: must be prl.curricula.NAME"),
+        ("cartpole", {"curriculum": prl.tasks.maze()}, "curriculum=Recipe.*: must be prl.curricul"),
+        (prl.curricula.plr(), {}, "task=Recipe.*: must be prl.tasks.NAME"),
+        ("cartpole", {"filter": True}, "filter=True: must be a name, settings or None"),
+        ("maze", {"scale": 3}, "scale=3: must be a name or None"),
+        ("maze", {"folder": 3}, "folder=3: must be a path or None"),
+        ("maze", {"settings": ["seed"]}, "settings=.*: must be a mapping or None"),
     ],
 )
 def test_what_is_no_run_names_what_was_given(task: Any, more: dict, message: str) -> None:

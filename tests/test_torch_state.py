@@ -146,16 +146,20 @@ def test_functions_of_a_loop_run_in_its_state() -> None:
         seen.append(now())
         return torch.rand(count, 3, generator=generator)
 
+    def made(values: Any, generator: torch.Generator) -> torch.Tensor:
+        return draw(len(values), generator)
+
     def performance(levels: Any) -> dict[str, Any]:
         seen.append(now())
         return dict.fromkeys(("success", "return"), [0.5] * len(levels))
 
     with users("float64"):
         prl.Teacher("domain_randomization", prl.LevelGenerator(draw)).propose(2)
+        prl.Teacher("domain_randomization", prl.MadeLevels({"s": (0.0, 1.0)}, made)).propose(2)
         prl.Teacher(
             prl.curricula.learning_progress(), SPACES["ranges"](), performance=performance
         ).propose(2)
-        assert len(seen) >= 2 and set(seen) == {now()}
+        assert len(seen) >= 3 and set(seen) == {now()}
 
 
 @pytest.mark.parametrize("state", [*STATES, *WITHIN])

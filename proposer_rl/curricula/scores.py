@@ -52,7 +52,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.contract import outcome_of
-from proposer_rl.curricula.student import VALUE, Student, advantages
+from proposer_rl.curricula.student import Student, advantages, values
 from proposer_rl.learning import succeeded
 from proposer_rl.settings import ArgumentError, Count, checked
 from proposer_rl.streams import Streams
@@ -75,7 +75,7 @@ AT_ONCE = 1024  # levels of each Solver that are evaluated at once
 STEPWISE: dict[str, Callable[[Student, TensorDictBase, Tensor], Tensor]] = {
     "positive_value_loss": lambda student, rollout, _: advantages(student, rollout).clamp_min(0),
     "l1_value_loss": lambda student, rollout, _: advantages(student, rollout).abs(),
-    "max_mc": lambda _, rollout, best: best.unsqueeze(-1) - rollout[VALUE].squeeze(-1).double(),
+    "max_mc": lambda _, rollout, best: best.unsqueeze(-1) - values(rollout).squeeze(-1).double(),
 }
 """Scores of every single step of a rollout [K, P, T], float64 and of that shape.
 
@@ -193,7 +193,8 @@ class Scorer:
         self.rollouts, self.from_episodes = rollouts, source == "episodes"
         self._warned = False
         self._own = _own_score(score)
-        self._name = name = score if isinstance(score, str) else score.__qualname__
+        own = getattr(score, "__qualname__", type(score).__name__)
+        self._name = name = score if isinstance(score, str) else own
         available = [*STEPWISE, *READS, "regret"] if self.from_episodes else [*EXACT]
         if self._own is None and name not in available:
             more = ", and functions of your own, as my_module.my_score" * self.from_episodes

@@ -310,6 +310,26 @@ def advantages(student: Student, rollout: TensorDictBase, lmbda: float | None = 
         student: whose discount and decay of traces are used.
         rollout: with ``state_value``, [K, n, T].
         lmbda: in place of the student's decay; 0 for the error of one step.
+
+    Raises:
+        ArgumentError: see :func:`values`.
     """
+    for steps in (rollout, rollout["next"]):
+        values(steps)
     estimate = gae(student.gamma, student.lmbda if lmbda is None else lmbda, VALUE)
     return estimate(rollout.copy())["advantage"].squeeze(-1).double()
+
+
+def values(steps: TensorDictBase) -> Tensor:
+    """Returns what a critic has written of steps, float [*B, 1].
+
+    Raises:
+        ArgumentError: if it has not.
+    """
+    if VALUE not in steps.keys():
+        raise ArgumentError(
+            f"rollout: has no {VALUE} in every step and next, which this curriculum reads; have a "
+            "critic write it first, as GAE does, or choose a score that needs none"
+        )
+    value: Tensor = steps[VALUE]
+    return value

@@ -32,7 +32,7 @@ def make_curriculum(
     Returns:
         The curriculum; its name or class and all settings that were said of it, for JSON.
     """
-    if not hasattr(space, "space"):
+    if isinstance(space, type) or not hasattr(space, "space"):
         raise ArgumentError(
             f"space={shown(space)}: must be Parameters, Items, LevelGenerator, MadeLevels or a task"
         )

@@ -86,10 +86,13 @@ def as_array(
         ArgumentError: naming the argument, if it has another shape or a number that is not finite
             in float32, or not allowed.
     """
-    if isinstance(value, Tensor):
+    if isinstance(value, Tensor) and not value.is_complex():
         value = value.detach().cpu().double()  # NumPy has no bfloat16
     try:
-        array = np.asarray(value, dtype=np.float64)
+        array = np.asarray(value)
+        if array.dtype.kind not in "biufO":  # such as complex numbers and texts
+            raise TypeError(array.dtype)
+        array = array.astype(np.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         # RuntimeError: tensors with a gradient; OverflowError: an integer beyond float64.
         raise ArgumentError(f"{name}={shown(value)}: must be numbers of float32") from error
@@ -199,15 +202,18 @@ def ended(
         be kept for the next rollout.
 
     Raises:
-        ArgumentError: if it does not say which levels it is of.
+        ArgumentError: if it does not say which levels it is of, or has no reward or done.
     """
+    for name in ("reward", "done"):
+        if name not in rollout["next"].keys():
+            raise ArgumentError(f"rollout: has no {name} in next, one number for each environment")
     if LEVEL_ID not in rollout.keys():
         raise ArgumentError(
             "rollout: has no level_id, so that nothing shows on which levels its episodes "
             "began; put LevelTransform around the environment, or give outcome_of(rollout) "
             "where each row begins with a reset on its level"
         )
-    steps: Any = rollout.flatten()
+    steps: Any = rollout.contiguous().flatten()  # also where it is stacked lazily
     if MASK in rollout.keys(True):  # rows are filled up to one length
         steps = steps[rollout[MASK].reshape(-1)]
     if kept is not None:

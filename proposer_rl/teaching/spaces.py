@@ -545,6 +545,8 @@ def _item_places(name: str, given: Any, count: int) -> list[int]:
 
 def _distributions(target: T | None, named: Mapping[str, T] | None) -> dict[str, T]:
     """Returns what is said of distributions beside the space itself, by their names."""
+    if not isinstance(named, Mapping | None):
+        raise ArgumentError(f"named={shown(named)}: must have distributions by their names")
     for name in named or {}:
         if name == "all" or (name == "target" and target is not None):
             raise ArgumentError(f"named.{name}: must have another name, which none has yet")

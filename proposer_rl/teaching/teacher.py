@@ -18,7 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
-from proposer_rl.curricula import Curriculum, Student, require
+from proposer_rl.curricula import Batch, Curriculum, Student, require
 from proposer_rl.curricula.batches import CPU, moved, packed
 from proposer_rl.curricula.ledger import OUT, OVER, RETURNED, Block, Ledger
 from proposer_rl.models import own_state
@@ -123,6 +123,10 @@ class Teacher:
         self.space, self.device, self.block = space, as_device(device), block
         self._seeds = [whole("seed", seed) + number for number in range(students)]
         self.curriculum, self._made_of = make_curriculum(curriculum, space, filter, self._seeds)
+        if not isinstance(student, Student | None):
+            raise ArgumentError(f"student={shown(student)}: must be a Student or None")
+        if student is not None and can:
+            raise ArgumentError(f"{next(iter(can))}: give it to the student, which is asked alone")
         self._alone = students == 1
         given = getattr(space, "given", lambda levels: levels)
         self.student = student or Student(
@@ -233,7 +237,7 @@ class Teacher:
                 raise ArgumentError("return_: missing: of each level, such as its success")
             if success is None:
                 self._require_success(False, "tell it with success=")
-            if self._alone and isinstance(ids, int):
+            if self._alone and type(ids) is int:
                 numbers = {name: as_number(name, value) for name, value in results.items()}
                 self._check_score(results)
                 self._ledger.tell_one(ids, numbers)
@@ -480,6 +484,12 @@ class Teacher:
             self.curriculum.observe(self.student, batch, as_outcome(results))
         streams = [Streams(seed, "update", self._proposals) for seed in self._seeds]
         batch = self.curriculum.propose(self.student, count, streams)
+        given = list(batch.notes.batch_size) if isinstance(batch, Batch) else type(batch).__name__
+        if given != [self.students, count]:
+            raise ArgumentError(
+                f"curriculum={type(self.curriculum).__name__}: must propose a Batch of levels "
+                f"{[self.students, count]}, got {given}"
+            )
         self._proposals += 1
         return self._ledger.add(batch)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -37,6 +38,13 @@ class _Played:
     knows: bool  # whether there is such a thing
     levels: Any = None  # [n], in one row
     asked = False
+
+
+class _Playing(WeakKeyDictionary[Any, _Played]):
+    """What an environment plays, by teacher; its copy in another process plays nothing yet."""
+
+    def __reduce__(self) -> Any:
+        return _Playing, ()
 
 
 class LevelTransform(Transform):
@@ -101,8 +109,9 @@ class LevelTransform(Transform):
     @property
     def _now(self) -> _Played:
         # The environment's: of a transform that another one steps through TorchRL makes a clone.
-        played: dict[int, _Played] = vars(self.parent.base_env).setdefault("_played", {})
-        return played.setdefault(id(self._teacher), _Played())
+        # Weak keys: another teacher may get the id of one that is gone.
+        played: _Playing = vars(self.parent.base_env).setdefault("_played", _Playing())
+        return played.setdefault(self._teacher, _Played())
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Adds ``level_id``."""

@@ -266,6 +266,7 @@ NINE = {"g": range(9)}
 BOTH, LOW = {"low": 0, "high": 1, "values": [1]}, {"low": 0, "high": 9}
 NO_PARAMETERS: list[tuple[Any, dict[str, Any], str]] = [
     ({3: (0.0, 1.0)}, {}, "ranges.3: must have a text as its name"),
+    ({"g": (0.0, 1.0)}, {"named": ["easy"]}, r"named=\['easy'\]: must have distributions by"),
     ({"g": ["a", "b", "a"]}, {}, "ranges.g=.*: must have each text once"),
     ({"g": ["a", "b"]}, {"target": {"g": []}}, r"target.g=\[\]: must be among"),
     ({"g": (0.0, HUGE)}, {}, r"ranges.g=\(0.0, 1e\+39\): .* both finite, at"),
@@ -326,11 +327,15 @@ NO_TEACHER: list[tuple[Any, dict[str, Any], str]] = [
     (LINE, {"device": "gpu"}, "device=gpu: must be one that torch has here"),
     (LINE, {"device": "cuda:99"}, "device=cuda:99: must be one that torch has here"),
     (LINE, {"sing": abs}, "sing: unknown; there are: play, "),
+    (LINE, {"student": 3}, "student=3: must be a Student or None"),
+    (LINE, {"student": prl.Student(), "play": abs}, "play: give it to the student"),
     ({"s": (0.0, 1.0)}, {}, "space={'s': .*: must be Parameters, Items"),
+    (prl.Items, {}, "space=<class .*: must be Parameters, Items"),
 ]
 NO_CURRICULUM: list[tuple[Any, dict[str, Any], str]] = [
     ("prl", {"space": LINE}, "curriculum='prl': must be .* one of accel"),
     (prl.curricula.plr, {"space": LINE}, "curriculum=<function plr .*: must be prl.curricula.NAME"),
+    (prl.tasks.maze(), {"space": LINE}, "curriculum=Recipe.*: must be prl.curricula.NAME"),
 ]
 PAIRS = prl.LevelGenerator(lambda n, g: torch.ones(n, 2), target=lambda n, g: torch.ones(n, 3))
 NO_GENERATOR: list[tuple[Any, dict[str, Any], str]] = [
@@ -384,6 +389,9 @@ TOO_LARGE: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
     "episodes": (lambda t: t.tell(0, 0, 1, episodes=10**16), r"episodes=1e\+16: .* at most 1e\+15"),
     "steps": (lambda t: t.tell([0], [0], [1], steps=1e30), r"steps=1e\+30: must be a whole number"),
     "a success": (lambda t: t.tell([0, 1], [0, 0], [1, np.nextafter(1, 2)]), "success=1: must be "),
+    "complex ones": (lambda t: t.tell([0], torch.tensor([1j]), 1), "return_=.*: must be numbers"),
+    "texts": (lambda t: t.tell([0], ["1"], 1), r"return_=\['1'\]: must be numbers of"),
+    "a truth value as a ticket": (lambda t: t.tell(True, 0, 1), "ids: must be whole numbers"),
     "a rollout's sum": (observe(3e38, 3e38), "return=inf: must be finite"),
     "one of float64": (observe(HUGE, dtype=torch.float64), r"return=1e\+39: must be finite"),
     "a sum of both signs": (observe(INF, -INF), "return=nan: must be finite"),

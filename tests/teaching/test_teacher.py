@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import io
 import json
+import math
 import pickle
 from collections.abc import Callable
 from multiprocessing import util
@@ -579,6 +580,37 @@ def test_a_rollout_without_success_is_refused_where_termination_may_be_failure()
     assert reached(success="truncated") == reached(
         success=lambda after: after["done"] & ~after["terminated"]
     )
+
+
+@pytest.mark.parametrize("name", ["reward", "done"])
+def test_a_rollout_of_several_agents_is_refused(name: str) -> None:
+    after = TensorDict({"reward": torch.ones(2, 1), "done": torch.ones(2, 1)}, [2])
+    rollout = TensorDict({"level_id": torch.zeros(2, 1), "next": {"agents": after}}, [2])
+    rollout["next"].update(after.exclude(name))
+    with pytest.raises(ArgumentError, match=f"^rollout: has no {name} in next"):
+        plr().observe(rollout)
+
+
+@pytest.mark.parametrize("score", ["l1_value_loss", "max_mc"])
+def test_a_rollout_without_values_is_refused_where_they_are_read(score: str) -> None:
+    ends = torch.ones(1, 1, 1, dtype=torch.bool)
+    after = {"done": ends, "terminated": ends, "reward": torch.ones(1, 1, 1)}
+    teacher = prl.Teacher(prl.curricula.plr(score=score), SPACE)
+    teacher.propose(1)
+    with pytest.raises(ArgumentError, match=r"^rollout: has no state_value"):
+        teacher.observe(prl.outcome_of(TensorDict({"next": after}, [1, 1])))
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 4), (1, 3), (1, 0)])
+def test_a_curriculum_of_ones_own_must_propose_what_was_asked_for(shape: tuple[int, ...]) -> None:
+    class Short(Curriculum):
+        def propose(self, student: Any, count: int, streams: Any) -> Batch:
+            return Batch(SPACE.sample(math.prod(shape), torch.Generator()).reshape(shape))
+
+    with pytest.raises(
+        ArgumentError, match=rf"^curriculum=Short: .* \[1, 4\], got .*{shape[-1]}\]"
+    ):
+        prl.Teacher(Short(), SPACE).propose(4)
 
 
 def test_a_copy_in_another_process_is_refused() -> None:

@@ -10,7 +10,7 @@ import gymnasium
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from tensordict import TensorDict
+from tensordict import TensorDict, lazy_stack
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.utils import split_trajectories
 from torchrl.data import Composite, Unbounded
@@ -101,7 +101,7 @@ def test_rollouts_say_themselves_which_levels_they_are_of(afresh: bool) -> None:
         ]
 
 
-@pytest.mark.parametrize("how", ["alternating", "one after another", "split"])
+@pytest.mark.parametrize("how", ["alternating", "one after another", "split", "lazy"])
 def test_an_episode_is_put_together_from_whichever_rows_it_is_in(how: str) -> None:
     """As of several workers that come by turns, or whose time is one line; or of trajectories."""
     teacher = counted("rollout", "success", block=3)
@@ -118,6 +118,8 @@ def test_an_episode_is_put_together_from_whichever_rows_it_is_in(how: str) -> No
         rollouts = [worker.rollout().clone() for worker in workers]
         if how == "split":
             rollouts = [split_trajectories(rollout) for rollout in rollouts]
+        if how == "lazy":
+            rollouts = [lazy_stack([*rollout.unbind(0)]) for rollout in rollouts]
         for rollout in [torch.cat(rollouts, 1)] if how == "one after another" else rollouts:
             teacher.observe(rollout)
     for worker in workers:
@@ -128,6 +130,20 @@ def test_an_episode_is_put_together_from_whichever_rows_it_is_in(how: str) -> No
         steps = int(length(number))
         assert rollout["observation"].flatten()[:steps].tolist() == list(range(steps))
         assert rollout["is_step"].sum() == steps
+
+
+def test_teachers_follow_one_another_on_one_environment() -> None:
+    """Python gives the ids of teachers that are gone to later ones."""
+    base, known = LevelsEnv(), set[int]()
+    for _ in range(100):
+        teacher = counted()
+        again = id(teacher) in known
+        known.add(id(teacher))
+        TransformedEnv(base, prl.LevelTransform(teacher, set_level)).rollout(1)
+        assert teacher.log()["dropped"] == 0
+        if again:
+            return
+        del teacher
 
 
 def test_rollouts_may_be_cut_by_a_transform_behind_it() -> None:
