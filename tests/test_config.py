@@ -7,6 +7,7 @@ import pickle
 import resource
 import shutil
 import sys
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -718,3 +719,13 @@ def test_whatever_the_values_a_run_starts_or_is_refused_in_one_line(
         assert list(folder.path.iterdir()) == []
     else:
         raise AssertionError("the signal was not heeded")
+
+
+def test_a_hand_designed_curriculum_that_never_comes_to_its_end_is_warned_of() -> None:
+    """And none of the arena's does so, whose updates are their own and stages perhaps inherited."""
+    with pytest.warns(UserWarning, match=r"^curriculum.until=\[3\]: .* ends after 3 updates$"):
+        composed("+scale=smoke", "+method=hand_designed", "schedule.updates=3")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for file in (CONFIG_FOLDER / "task" / "arena").glob("*.yaml"):
+            composed(f"task=arena/{file.stem}", "+method=hand_designed")

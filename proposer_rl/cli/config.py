@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import re
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -177,6 +178,14 @@ def read_config(config: DictConfig) -> RunConfig:
         )
     if len(set(checked.seeds)) < len(checked.seeds):
         raise ConfigError(f"seeds={checked.seeds}: must be distinct")
+    until = checked.curriculum.get("until")
+    ends = [end for end in until if isinstance(end, int)] if isinstance(until, list) else []
+    if max(ends, default=0) >= checked.schedule.updates:
+        warnings.warn(
+            f"curriculum.until={until}: the last stage never begins, since the run ends after "
+            f"{checked.schedule.updates} updates",
+            stacklevel=2,
+        )
     return checked
 
 

@@ -204,15 +204,15 @@ def ended(
     Raises:
         ArgumentError: if it does not say which levels it is of, or has no reward or done.
     """
-    for name in ("reward", "done"):
-        if name not in rollout["next"].keys():
-            raise ArgumentError(f"rollout: has no {name} in next, one number for each environment")
     if LEVEL_ID not in rollout.keys():
         raise ArgumentError(
             "rollout: has no level_id, so that nothing shows on which levels its episodes "
             "began; put LevelTransform around the environment, or give outcome_of(rollout) "
             "where each row begins with a reset on its level"
         )
+    for name in ("reward", "done"):
+        if name not in rollout["next"].keys():
+            raise ArgumentError(f"rollout: has no {name} in next, one number for each environment")
     steps: Any = rollout.contiguous().flatten()  # also where it is stacked lazily
     if MASK in rollout.keys(True):  # rows are filled up to one length
         steps = steps[rollout[MASK].reshape(-1)]
