@@ -47,7 +47,6 @@ templates_path = ["_templates"]
 nitpicky = True
 nitpick_ignore = [  # stand-ins, see below
     ("py:class", "transformers.TrainerCallback"),
-    ("py:class", "verl.experimental.dataset.sampler.AbstractCurriculumSampler"),
     ("py:class", "TensorDictBase"),  # of tensordict, in a text alone
 ]
 
@@ -57,7 +56,7 @@ myst_heading_anchors = 3
 autosummary_ignore_module_all = True  # a name is documented where it is defined
 autodoc_default_options = {"members": True, "show-inheritance": True, "ignore-module-all": True}
 autodoc_member_order = "bysource"
-autodoc_mock_imports = ["transformers", "verl"]  # which docs do without
+autodoc_mock_imports = ["transformers"]  # which docs do without
 autodoc_typehints_format = "short"
 autodoc_use_type_comments = False  # every function's source would be parsed for them
 maximum_signature_line_length = 88

@@ -109,7 +109,7 @@ def test_everything_runs_where_only_what_it_requires_is_installed(
 
 
 # What comes with the loop that is taught, or with a logger that the tests do without.
-BROUGHT = {"stable_baselines3", "transformers", "verl", "wandb"}
+BROUGHT = {"stable_baselines3", "transformers", "wandb"}
 
 
 def test_whatever_it_imports_anywhere_is_required(built: Built) -> None:
