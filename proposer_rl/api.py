@@ -45,7 +45,6 @@ from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.mazes import Level, LevelSpec, MazeEnv, generate_levels, shortest_path_length
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator, RolloutEvaluator
 from proposer_rl.teaching import (
-    ActorStudent,
     Items,
     LevelGenerator,
     LevelTerm,
@@ -66,7 +65,6 @@ __all__ = [
     "DEFAULT_METHOD",
     "PPO",
     "ActorCritic",
-    "ActorStudent",
     "ArgumentError",
     "Batch",
     "ComputeContext",

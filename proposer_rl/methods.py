@@ -27,7 +27,6 @@ from proposer_rl.curricula import (
     ProposerCurriculum,
     ProposerTrainer,
     ReplayRule,
-    SampledFirstOrderProposer,
     SamplingCurriculum,
     Schedule,
     Scorer,
@@ -393,23 +392,6 @@ def first_order_proposer(
     """
     policy = _problem_policy(components, epochs, learning_rate, entropy_coeff, checkpoint)
     return make(FirstOrderProposer, settings, components, **policy)
-
-
-def first_order_proposer_sampled(
-    components: Components,
-    epochs: Count,
-    learning_rate: Positive,
-    entropy_coeff: NotNegative,
-    checkpoint: str | None = None,
-    **settings: Any,
-) -> SampledFirstOrderProposer:
-    """Makes a Proposer that is rewarded by the Solver's own training episodes, without an oracle.
-
-    The arguments are those of :func:`first_order_proposer`; ``settings`` those of
-    :class:`SampledFirstOrderProposer`.
-    """
-    policy = _problem_policy(components, epochs, learning_rate, entropy_coeff, checkpoint)
-    return make(SampledFirstOrderProposer, settings, components, **policy)
 
 
 def paired(

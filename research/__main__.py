@@ -8,7 +8,6 @@ from importlib import import_module
 NAMES = {
     "snr": "the signal-to-noise ratio of a Proposer's reward",
     "foresight": "how far ahead first-order gain predicts gains",
-    "credit": "how much of a bin's first-order credit episodes tell",
     "conditioning": "whether a Proposer conditions on the Solver",
     "intervals": "how often intervals over few seeds hold what they are of",
     "slurm": "runs under a real Slurm of one node: time-outs, preemption, scancel",

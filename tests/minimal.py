@@ -159,7 +159,7 @@ def commands(extra: str, methods: list[str]) -> Iterator[list[str]]:
             yield _trained(method, f"+method={method}", *FEW, *LONGER)
         yield _trained("frozen", "+method=frozen_proposer", *FEW, f"checkpoint={RUN}/perf_gain")
         yield _trained("views", "task=view_maze_smoke", "+method=robust_plr", *SMALL)
-        yield _trained("cartpole", "task=cartpole", "+method=first_order_sampled", *GYMNASIUM)
+        yield _trained("cartpole", "task=cartpole", "+method=model_transport", *GYMNASIUM)
         few = [*SMALL, "task.levels=2", "task.max_steps=8", "solver.ppo.horizon=8"]
         yield _trained("gates", "task=point_mass", "+method=domain_randomization", *few)
         yield _trained("robots", "task=robots", "+method=terrain_levels", *few)

@@ -39,8 +39,8 @@ CALLED = {
     "modelled": ["+method=regret", "+source=model", *QUIET],
     "window": ["+method=perf_gain", "task=view_maze_smoke", *FEW, *SHORT, *CYCLE],
     "gymnasium": ["+method=robust_plr", "task=cartpole", *TINY, "schedule.updates=3"],
-    "proposer": ["+method=first_order_proposer_sampled", *QUIET],
-    "normalized": ["+method=first_order_sampled", "task=cartpole", *TINY, *FEW, *NORMALIZED],
+    "proposer": ["+method=first_order_proposer", *QUIET],
+    "normalized": ["+method=model_transport", "task=cartpole", *TINY, *FEW, *NORMALIZED],
     "choices": ["+method=plr", *CHOICES, *FEW],
     "batched": ["+method=plr", "task=arena/hill", *GATE, *FEW],
     "memory": ["+method=plr", "task=cartpole", *TINY, *FEW, "task.network.memory=4"],
@@ -77,7 +77,7 @@ def test_a_run_mixes_no_devices(name: str, run_there: Run, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["first_order_sampled", "first_order_proposer_sampled"])
+@pytest.mark.parametrize("method", ["model_transport", "plr"])
 def test_a_run_is_resumed_there(method: str, run_there: Run, tmp_path: Path) -> None:
     """In the middle of episodes: levels, memories and gradients come from a checkpoint."""
     given = [f"+method={method}", "task=cartpole", *TINY, *FEW, *NORMALIZED]

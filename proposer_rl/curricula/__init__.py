@@ -33,17 +33,11 @@ from proposer_rl.curricula.contract import Inbox as Inbox
 from proposer_rl.curricula.contract import LearnedCurriculum as LearnedCurriculum
 from proposer_rl.curricula.contract import outcome_of as outcome_of
 from proposer_rl.curricula.first_order import FirstOrderCurriculum as FirstOrderCurriculum
-from proposer_rl.curricula.first_order import (
-    SampledFirstOrderCurriculum as SampledFirstOrderCurriculum,
-)
 from proposer_rl.curricula.gaussians import MixtureCurriculum as MixtureCurriculum
 from proposer_rl.curricula.outcome_model import Modelled as Modelled
 from proposer_rl.curricula.problem_proposer import FirstOrderProposer as FirstOrderProposer
 from proposer_rl.curricula.problem_proposer import PairedProposer as PairedProposer
 from proposer_rl.curricula.problem_proposer import ProblemProposer as ProblemProposer
-from proposer_rl.curricula.problem_proposer import (
-    SampledFirstOrderProposer as SampledFirstOrderProposer,
-)
 from proposer_rl.curricula.progress import LearningProgressCurriculum as LearningProgressCurriculum
 from proposer_rl.curricula.prompts import AdaptiveDifficulty as AdaptiveDifficulty
 from proposer_rl.curricula.prompts import ArcLengthFilter as ArcLengthFilter

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
@@ -19,7 +18,6 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import NoSuccessError, Space, refuse_unfit_bins
 
 Measure = Literal["success", "return"]
-MANY = 10_000  # levels of a scoring pass, beyond which there is a warning
 
 
 class BinCurriculum(Curriculum):
@@ -136,22 +134,6 @@ def means_of_bins(choices: Tensor, values: Tensor, size: int) -> tuple[Tensor, T
     return none.scatter_add(1, choices, values) / counts, counts
 
 
-def warn_of_cost(space: Space, each: int, name: str) -> None:
-    """Warns where a scoring pass evaluates many levels.
-
-    Args:
-        space: that has the bins.
-        each: levels of each bin.
-        name: of the argument that sets this number.
-    """
-    if space.size * each > MANY:
-        warnings.warn(
-            f"{space.size:,} bins with {each} {name} each: {space.size * each:,} levels are "
-            f"evaluated at every scoring pass; fewer bins, or a lower `{name}`, cost less",
-            stacklevel=2,
-        )
-
-
 class Probes:
     """Fixed levels of every bin, each student's own, on which its performance is measured.
 
@@ -168,7 +150,6 @@ class Probes:
 
     def __init__(self, space: Space, count: int, measure: Measure) -> None:
         self._space, self._count, self.measure = space, count, measure
-        warn_of_cost(space, count, "probes")
         self._drawn_from: list[list[Any]] = []
         self._levels: Any = None
 

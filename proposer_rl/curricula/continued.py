@@ -32,9 +32,6 @@ from proposer_rl.task import Levels
 # agent was; what is larger, as images, takes most of the memory.
 FEW = 16
 
-GRADIENTS = {"policy_gradient_norms", "sampled_alignment"}
-"""Needs of a curriculum that reads what a policy has seen off rollouts."""
-
 Played = tuple[Levels, TensorDictBase]
 """Levels [K, m], and a rollout [K, m, T] with one episode on each."""
 
@@ -128,7 +125,7 @@ class ContinuedLevels:
     def _cut(self, rollout: TensorDictBase) -> None:
         """Notes the episodes that ended in a rollout [K, P, T], and keeps what has not ended."""
         kept = rollout.exclude("advantage", "value_target")
-        if not GRADIENTS & {*self._curriculum.needs}:
+        if "policy_gradient_norms" not in self._curriculum.needs:  # which reads what was seen
             seen = self._learner.agent.step_keys
             large = [key for key in seen if kept.get(key).shape[3:].numel() > FEW]
             kept = kept.exclude(*large, *(("next", key) for key in large))

@@ -13,16 +13,15 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 
 from proposer_rl.curricula.batches import device_of
-from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
-from proposer_rl.curricula.contract import PATIENCE, Batch, Curriculum, Inbox
-from proposer_rl.curricula.first_order import SampledFirstOrderCurriculum, alignments
+from proposer_rl.curricula.bins import along_axes, counts_of_bins
+from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.proposer import learnt_proposer
 from proposer_rl.curricula.student import Student, TaskStudent
 from proposer_rl.learning import PPOSettings, load_agent, located
 from proposer_rl.learning.objective import require_finite
 from proposer_rl.meta.first_order import TargetMeasure
 from proposer_rl.models import ActorCritic, draw_at
-from proposer_rl.settings import Count, Decay, Positive, checked
+from proposer_rl.settings import Count, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space, refuse_unfit_bins
 
@@ -81,13 +80,20 @@ class ProblemProposer(Curriculum):
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._metrics: dict[str, float] = {}
 
-    def _draw(
-        self, student: Student, count: int, streams: Sequence[Streams]
-    ) -> tuple[TensorDict, TensorDict, Tensor, Levels]:
-        """Draws at least ``count`` levels, P at a time, by choices [times, 1, P] of the policy.
+    @abstractmethod
+    def reward(
+        self, student: Student, levels: Levels, stream: Streams
+    ) -> tuple[Tensor, dict[str, float]]:
+        """Returns the rewards of levels [1, E], float [1, E], and metrics."""
 
-        Returns:
-            What the policy observes [1], its actions, and their bins and levels [1, times * P].
+    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+        """Draws levels [1, n] from the policy, which learns from them at once.
+
+        The policy draws P at a time, and learns from all that it drew.
+
+        Raises:
+            ValueError: for several students: a Proposer learns from one.
+            DivergedError: if an advantage, a loss, a gradient or a weight is not finite.
         """
         if len(streams) != 1:
             raise ValueError(f"a Proposer learns from one Solver, got {len(streams)}")
@@ -102,9 +108,16 @@ class ProblemProposer(Curriculum):
             choices = draw_at(policy, noise.to(seen["probes"].device))  # [times, 1, P]
             log_prob = policy.log_prob(choices)
         bins = choices.view(1, -1).cpu()  # [1, times * P]
-        drawn = {agent.action_key: choices, agent.log_prob_key: log_prob}
         levels = self.space.generate(bins, [stream.generator("levels")])
-        return seen, TensorDict(drawn, choices.shape), bins, levels
+        reward, metrics = self.reward(student, levels, stream)
+        drawn = {
+            agent.action_key: choices,
+            agent.log_prob_key: log_prob,
+            "advantage": reward.view(*choices.shape, 1),
+        }
+        self._learn(seen, TensorDict(drawn, choices.shape))
+        self._metrics |= metrics
+        return self._inbox.batch(levels[:, :count], bins=bins[:, :count])
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Counts the levels that came back."""
@@ -133,13 +146,11 @@ class ProblemProposer(Curriculum):
         load_agent(self.agent, TensorDict(state["proposer"]))
         self._adam.load_state_dict(deepcopy(state["adam"]))
 
-    def _learn(
-        self, seen: TensorDict, played: TensorDict, problems: Tensor | slice = slice(None)
-    ) -> None:
-        """Makes a few gradient steps on draws [times, 1, m] of these problems, int64 [m]."""
+    def _learn(self, seen: TensorDict, played: TensorDict) -> None:
+        """Makes a few gradient steps on draws [times, 1, P]."""
         steps = []
         for _ in range(self._settings.epochs):
-            logits = self.agent(seen.copy())[self.agent.logits_key][:, problems]  # [K, m, N]
+            logits = self.agent(seen.copy())[self.agent.logits_key]  # [1, P, N]
             everywhere = logits.expand(len(played), -1, -1, -1)
             losses = self._loss(played.copy().set(self.agent.logits_key, everywhere))
             self._adam.zero_grad()
@@ -156,30 +167,7 @@ class ProblemProposer(Curriculum):
         }
 
 
-class _RewardedAtOnce(ProblemProposer):
-    """A policy that learns from all that it drew before anybody trains on any of it."""
-
-    @abstractmethod
-    def reward(
-        self, student: Student, levels: Levels, stream: Streams
-    ) -> tuple[Tensor, dict[str, float]]:
-        """Returns the rewards of levels [1, E], float [1, E], and metrics."""
-
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Draws levels [1, n] from the policy, which learns from them at once.
-
-        Raises:
-            ValueError: for several students: a Proposer learns from one.
-            DivergedError: if an advantage, a loss, a gradient or a weight is not finite.
-        """
-        seen, drawn, bins, levels = self._draw(student, count, streams)
-        reward, metrics = self.reward(student, levels, streams[0])
-        self._learn(seen, drawn.set("advantage", reward.view(*drawn.shape, 1)))
-        self._metrics |= metrics
-        return self._inbox.batch(levels[:, :count], bins=bins[:, :count])
-
-
-class FirstOrderProposer(_RewardedAtOnce):
+class FirstOrderProposer(ProblemProposer):
     """Rewards each problem with its alignment, its first-order share of the target's gain.
 
     The alignment of a level is the slope of its return along the direction of the parameters that
@@ -225,94 +213,7 @@ class FirstOrderProposer(_RewardedAtOnce):
         }
 
 
-class SampledFirstOrderProposer(ProblemProposer):
-    """Rewards each problem with the alignment of its training episodes.
-
-    Alignments and direction are those of
-    :class:`~proposer_rl.curricula.first_order.SampledFirstOrderCurriculum`, from the student's own
-    episodes; nothing is played for them. So the reward comes after the training: before it proposes
-    again, the policy learns from the levels that came back. Those of a batch that come in between
-    the same two proposals are compared; what is still out when 32 newer batches have been proposed
-    counts no more.
-
-    Args:
-        space, target, agent, settings, probe_levels: see :class:`ProblemProposer`.
-        target_shares: the target as shares of the bins, float [N].
-        delta: least performance of a bin that the interim target lies on.
-        probes: levels of each bin on which performance is measured.
-        measure: of performance, ``"success"`` or ``"return"``.
-        smoothing: share of the old in the direction's average.
-    """
-
-    needs = ("probe", *SampledFirstOrderCurriculum.needs)
-    reads = ("rollout",)
-    remembers = (*ProblemProposer.remembers, "_credit", "_drawn")
-
-    @checked
-    def __init__(
-        self,
-        space: Space,
-        target: Distribution,
-        agent: ActorCritic,
-        settings: PPOSettings,
-        target_shares: Tensor,
-        *,
-        probe_levels: int = 16,
-        delta: float = 0.2,
-        probes: Count = 4,
-        measure: Measure = "success",
-        smoothing: Decay = 0.9,
-    ) -> None:
-        super().__init__(space, target, agent, settings, probe_levels=probe_levels)
-        self._credit = SampledFirstOrderCurriculum(
-            space, target_shares, delta=delta, probes=probes, measure=measure, smoothing=smoothing
-        )
-        self._drawn: dict[int, dict[str, Tensor]] = {}  # by the batch: what was seen, and choices
-
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Lets the policy learn from the levels that came back, and draws levels [1, n] from it.
-
-        Raises:
-            ValueError: for several students.
-            DivergedError: if an advantage, a loss, a gradient or a weight is not finite.
-        """
-        self._learn_from_episodes()
-        seen, drawn, bins, levels = self._draw(student, count, streams)
-        self._credit.score(student, count, streams)
-        which = torch.arange(count).unsqueeze(0)
-        batch = self._inbox.batch(levels[:, :count], bins=bins[:, :count], which=which)
-        number = int(batch.notes["number"][0, 0])
-        waiting = {k: v for k, v in self._drawn.items() if k > number - PATIENCE}
-        self._drawn = {**waiting, number: {**dict(seen.items()), **dict(drawn.items())}}
-        return batch
-
-    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Counts the levels, and puts their alignments aside."""
-        super().observe(student, batch, outcome)
-        if evidence := self._credit.evidence(student, batch, outcome):
-            self._inbox.put(batch, which=batch.notes["which"], **evidence)
-
-    def _learn_from_episodes(self) -> None:
-        """Trains the policy on the levels that came back, batch by batch."""
-        device = self._parameters[0].device  # what a checkpoint holds is on the CPU
-        for evidence in self._inbox.take():
-            drawn = self._drawn.get(int(evidence["number"][0, 0]))
-            if drawn is None or evidence.shape[1] < 2:  # one cannot be better than the others
-                continue
-            here = {key: entry.to(device) for key, entry in drawn.items()}
-            seen = TensorDict({"probes": here.pop("probes")}, [1])
-            problems = next(iter(here.values())).shape[2]
-            reward, which = alignments(evidence).to(device), evidence["which"][0].to(device)
-            played = {key: entry.view(1, 1, -1)[..., which] for key, entry in here.items()}
-            played["advantage"] = reward.float().view(1, 1, -1, 1)
-            self._learn(seen, TensorDict(played, [1, 1, len(which)]), which % problems)
-            self._metrics |= {
-                "alignment": float(reward.mean()),
-                "alignment_sd": float(reward.std(correction=0)),
-            }
-
-
-class PairedProposer(_RewardedAtOnce):
+class PairedProposer(ProblemProposer):
     """Rewards each problem with the regret between two students.
 
     PAIRED (Dennis et al. 2020, arXiv 2012.02096, algorithm 1): protagonist and antagonist train on

@@ -21,13 +21,8 @@ from proposer_rl.learning import PPO, RolloutCollector, gae
 from proposer_rl.meta.first_order import (
     Direction,
     LevelGradients,
-    alignment,
     exact_alignment,
     exact_direction,
-    in_adams_units,
-    log_probabilities,
-    over_steps,
-    surrogate,
 )
 from proposer_rl.settings import ArgumentError
 from proposer_rl.task import (
@@ -101,21 +96,6 @@ class Student:
     """Slope of the return on each level along a direction of the parameters, float [K, n].
 
     The last argument is the step of the differences, in learning rates.
-    """
-    sampled_direction: Callable[[TensorDictBase, Tensor], Direction]
-    """The policy gradient of a rollout [K, n, T] whose levels have weights, float [K, n].
-
-    The sum over the levels of their weights times the gradients of the means over the steps of
-    A_t log pi, with advantages A_t that are not standardised, in units of the optimiser's steps:
-    what parts of a batch give adds up.
-    """
-    sampled_alignment: Callable[[Direction, TensorDictBase], TensorDict]
-    """The parts of the alignment of levels, from a rollout [K, n, T] on them.
-
-    ``slope`` [K, n], the slope along the direction of the mean over the steps of A_t log pi, with
-    advantages A_t that are not standardised. Where the students' training standardises them over a
-    batch: ``drift``, the slope of log pi alone; and ``advantage`` and ``square``, the means of A_t
-    and of its square, so that this can be done when all of it has come in.
     """
     snapshot: Callable[[], TensorDict]
     """All that training changes of the students, batch [K]."""
@@ -249,28 +229,6 @@ class TaskStudent(Student):
         return exact_alignment(
             cast(DifferentiableTask, self._task), self._learner, direction, levels, step
         )
-
-    def _sampled_direction(self, rollout: TensorDictBase, weights: Tensor) -> Direction:
-        learner, advantage = self._learner, advantages(self, rollout).float()
-        with torch.enable_grad():
-            gained = surrogate(learner.agent, rollout, advantage) * weights.to(advantage)
-            return in_adams_units(learner, gained.sum(1))
-
-    def _sampled_alignment(self, direction: Direction, rollout: TensorDictBase) -> TensorDict:
-        agent, advantage = self._learner.agent, advantages(self, rollout)
-
-        def gained() -> Tensor:
-            log_prob = log_probabilities(agent, rollout).double()
-            each = advantage * log_prob, log_prob
-            return torch.stack([over_steps(values, rollout) for values in each], -1)
-
-        slopes = alignment(agent, direction, self._learner.settings.learning_rate, gained)
-        parts = {"slope": slopes[..., 0]}
-        if self._learner.settings.normalize_advantage:
-            parts["drift"] = slopes[..., 1]
-            for name, values in {"advantage": advantage, "square": advantage.square()}.items():
-                parts[name] = over_steps(values, rollout)
-        return TensorDict(parts, slopes.shape[:2])
 
     def train(self, levels: Levels, generators: Sequence[torch.Generator]) -> None:
         """Trains on levels [K, n], with an update for each ``batch_size`` of them.

@@ -19,7 +19,6 @@ from proposer_rl.task import Space
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-MOST_BINS = 4096
 # Of a program, for steps of about ten seconds: 250 items in a row take as long as 8³ bins.
 MOST_IN_A_ROW, MOST_OF_A_GRID = 256, 512
 NOTHING = 1e-6  # a share that is rounding of the solver's
@@ -136,16 +135,7 @@ def shares_of_bins(shares: Tensor, space: Space) -> Tensor:
 
 
 def squared_distances(space: Space) -> Tensor:
-    """Returns the squared distances between the bins of a space: float64 [N, N].
-
-    Raises:
-        ArgumentError: if there are too many bins.
-    """
-    if space.size > MOST_BINS:
-        raise ArgumentError(
-            f"space: {space.size:,} bins: at most {MOST_BINS:,}, of whose squares tables are made; "
-            "give its axes fewer"
-        )
+    """Returns the squared distances between the bins of a space: float64 [N, N]."""
     places = space.coordinates.double()
     return torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist").square()
 
@@ -158,34 +148,6 @@ def mastered(performance: Tensor, delta: float) -> Tensor:
         delta: least performance of a mastered bin.
     """
     return performance >= performance.amax(-1, keepdim=True).clamp(max=delta)
-
-
-def interim_target(target: Tensor, costs: Tensor, allowed: Tensor) -> Tensor:
-    """Returns the distribution on allowed bins nearest to the target, in 2-Wasserstein distance.
-
-    Each bin of the target gives its share to the nearest allowed ones, to several in equal parts.
-
-    Args:
-        target: shares that add up to one, float64 [N].
-        costs: squared distances between bins, float64 [N, N].
-        allowed: bool [K, N], at least one of each student's.
-
-    Returns:
-        float64 [K, N].
-
-    Example:
-        >>> places = torch.arange(4.0, dtype=torch.float64).unsqueeze(1)
-        >>> target = torch.tensor([0.0, 0.0, 0.5, 0.5], dtype=torch.float64)
-        >>> allowed = torch.tensor([[True, True, False, True]])
-        >>> interim_target(target, torch.cdist(places, places).square(), allowed)
-        tensor([[0.0000, 0.2500, 0.0000, 0.7500]], dtype=torch.float64)
-    """
-    moved = []
-    for own in allowed:
-        reached = costs.where(own, torch.inf)  # from the target's bins to those
-        nearest = (reached == reached.amin(-1, keepdim=True)).to(target)
-        moved.append(target @ (nearest / nearest.sum(-1, keepdim=True)))
-    return torch.stack(moved)
 
 
 def step_towards(

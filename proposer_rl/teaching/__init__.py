@@ -1,6 +1,5 @@
 """Curricula in loops of one's own: a teacher, spaces of levels, TorchRL, Gymnasium, data sets."""
 
-from proposer_rl.teaching.abilities import ActorStudent as ActorStudent
 from proposer_rl.teaching.gymnasium import TaughtEnv as TaughtEnv
 from proposer_rl.teaching.remote import TeacherClient as TeacherClient
 from proposer_rl.teaching.robots import LevelTerm as LevelTerm

@@ -20,7 +20,7 @@ from research.benchmarks.timing import Timings, interleave, ratio, threads, tota
 
 REFERENCE = "domain_randomization"
 # Those that train no copies of the Solver.
-COMPARED = ("hand_designed", "first_order_gain", "first_order_sampled", "first_order_proposer")
+COMPARED = ("hand_designed", "first_order_gain", "first_order_proposer")
 STRETCH = 2  # updates timed together: a curriculum may look at the Solver only now and then
 
 

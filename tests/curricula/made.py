@@ -23,8 +23,6 @@ from proposer_rl.curricula import (
     ReplayCurriculum,
     ReplayRule,
     RowsCurriculum,
-    SampledFirstOrderCurriculum,
-    SampledFirstOrderProposer,
     SamplingCurriculum,
     Schedule,
     Scorer,
@@ -94,12 +92,6 @@ def first_order_proposer() -> FirstOrderProposer:
     )
 
 
-def sampled_proposer() -> SampledFirstOrderProposer:
-    return SampledFirstOrderProposer(
-        SPACE, TARGET, problem_agent(), SETTINGS, TASK.target_shares, probe_levels=2
-    )
-
-
 def learnt() -> ProposerCurriculum:
     """The paper's, in small."""
     settings = ProposerSettings(
@@ -165,7 +157,6 @@ MADE: dict[str, Make] = {
     "currot": lambda: TransportCurriculum(SPACE, TASK.target_shares, delta=0.2, every=2, probes=2),
     "adaptive_mixture": lambda: AdaptiveMixture(SPACE, TARGET, TASK.inputs),
     "first order": lambda: FirstOrderCurriculum(SPACE, TARGET, target_levels=8, candidates=2),
-    "first order, sampled": lambda: SampledFirstOrderCurriculum(SPACE, TASK.target_shares),
     "filtered bins": lambda: filtered(
         LearningProgressCurriculum(SPACE, source="episodes", every=2)
     ),
@@ -207,8 +198,6 @@ LEARNED: dict[str, Make] = {
     "filtered perf_gain": lambda: filtered(learnt()),
     "frozen": frozen,
     "first_order_proposer": first_order_proposer,
-    "first_order_proposer, sampled": sampled_proposer,
-    "filtered first_order_proposer, sampled": lambda: modelled(filtered(sampled_proposer())),
     "paired": paired,
     "filtered paired": lambda: filtered(paired(), times=2),
 }

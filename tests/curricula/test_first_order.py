@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
-from itertools import product
 from types import SimpleNamespace
 from typing import Any
 
-import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
 from proposer_rl.curricula import (
     FirstOrderCurriculum,
-    SampledFirstOrderCurriculum,
-    Student,
     TaskStudent,
-    outcome_of,
 )
-from proposer_rl.curricula.student import advantages
 from proposer_rl.learning import PPO
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
-from proposer_rl.tasks.mazes import Level, SpecificationSpace, shortest_path_length
+from proposer_rl.tasks.mazes import Level, SpecificationSpace
 from proposer_rl.tasks.mazes.distributions import LevelDistribution
 from tests.meta import test_first_order as exact
 
@@ -188,99 +181,3 @@ def test_the_log_has_standard_errors_and_how_even_the_shares_are() -> None:
         torch.distributions.Categorical(shares).entropy(),
     )
     assert all(1 <= bins <= BINS for bins in told["effective_bins"])
-
-
-def sampled(**options: Any) -> SampledFirstOrderCurriculum:
-    shares = torch.eye(BINS)[-1]
-    return SampledFirstOrderCurriculum(Mazes().space, shares, **{"probes": 1, **options})
-
-
-def bins_of(levels: Any) -> Tensor:
-    """Of mazes of the space, found anew: [*B]."""
-    wanted = torch.tensor(Mazes().space.specifications)  # fraction, length
-    found = levels.walls.double().mean((-2, -1)), shortest_path_length(levels).double()
-    each = (
-        (f.unsqueeze(-1) - w).abs() < error
-        for f, w, error in zip(found, wanted.T, (0.05, 0.5), strict=True)
-    )
-    return torch.stack([*each]).all(0).int().argmax(-1)
-
-
-def weighted(solvers: PPO, rollout: Any, weights: Tensor) -> dict[str, Tensor]:
-    """Of each Solver, the weighted sum of its levels' policy gradients, in Adam's units."""
-    advantage = advantages(TaskStudent(Mazes(), solvers), rollout)
-    gradients = [
-        exact.gradient(
-            solvers.agent, exact.surrogate(solvers.agent, rollout, advantage)[:, p].sum()
-        )
-        for p in range(P)
-    ]
-    adam, found = solvers.snapshot(), {}
-    for name, entry in gradients[0].items():
-        each = [weights[:, p].view(-1, *[1] * (entry.ndim - 1)) for p in range(P)]
-        total = sum(w * gradient[name] for w, gradient in zip(each, gradients, strict=True))
-        moment = adam[name, "exp_avg_sq"] / (1 - 0.999**3)  # after three steps
-        found[name] = total / (moment.sqrt() + solvers.settings.adam_eps)
-    return found
-
-
-@pytest.mark.parametrize("standardised", [False, True])
-def test_sampled_scores_are_inner_products_with_the_interim_targets_gradient(
-    standardised: bool,
-) -> None:
-    """Two updates: the first tells the direction, the second the scores."""
-    solvers, curriculum = learner(), sampled(smoothing=0.0)
-    solvers.settings = replace(solvers.settings, normalize_advantage=standardised)
-    own, student = streams(0, 0, 1), taught(Mazes(), solvers)
-    rollouts = []
-    for _ in range(2):
-        batch = curriculum.propose(student, P, own)
-        solvers.env.set_levels(batch.levels)
-        rollouts.append(solvers.collect([s.generator("actions") for s in own]))
-        before = curriculum.state_dict()["scores"]["interim"]
-        curriculum.observe(student, batch, outcome_of(rollouts[-1]))
-        if len(rollouts) == 1:
-            found, where = curriculum.state_dict()["gradient"], bins_of(batch.levels)
-            expected = weighted(solvers, rollouts[0], before.gather(1, where))
-            for name, entry in expected.items():
-                torch.testing.assert_close(found[name], entry.to(found[name]), rtol=1e-3, atol=1e-7)
-    direction = curriculum.state_dict()["direction"]
-    size = exact.inner(direction, direction) / sum(e[0].numel() for e in direction.values())
-    torch.testing.assert_close(size, torch.ones_like(size))
-    cosine = exact.inner(direction, expected) / exact.inner(expected, expected).sqrt()
-    torch.testing.assert_close(cosine, exact.inner(direction, direction).sqrt())
-    curriculum.log()
-    found = curriculum.state_dict()["scores"]["score"]
-    where = bins_of(batch.levels)
-    advantage = advantages(student, rollouts[1])
-    if standardised:
-        advantage = advantage - advantage.mean((1, 2), keepdim=True)
-        advantage = advantage / advantage.std((1, 2), keepdim=True)
-    for k, n in product(range(2), range(BINS)):
-        worth, some = exact.surrogate(solvers.agent, rollouts[1], advantage), where[k] == n
-        mean = worth[k][some].mean() if some.any() else 0 * worth.sum()
-        aligned = exact.inner(direction, exact.gradient(solvers.agent, mean))[k]
-        torch.testing.assert_close(found[k, n].double(), aligned.double(), rtol=1e-3, atol=1e-6)
-
-
-def test_the_interim_target_moves_with_what_is_mastered_at_no_cost_of_its_own() -> None:
-    curriculum = sampled(delta=0.5)
-    told = torch.tensor([[0.9, 0.6, 0.1, 0.2, 0.1, 0.0]])
-    student = Student(performance=lambda levels, g: TensorDict({"success": told}, [1, BINS]))
-    curriculum.propose(student, P, streams(0, 0))
-    # Of (fraction, length) bins the target is the last, and (0, 4) the nearest that is mastered.
-    assert curriculum.state_dict()["scores"]["interim"].tolist() == [[0, 1, 0, 0, 0, 0]]
-    told += 0.5
-    curriculum.propose(student, P, streams(1, 0))
-    assert curriculum.state_dict()["scores"]["interim"].tolist() == [[0, 0, 0, 0, 0, 1]]
-    assert (student.frames, student.evaluations) == (0, 0)
-
-
-def test_exploration_is_spread_over_all_bins() -> None:
-    solvers, curriculum = learner(), sampled(exploration=0.3, temperature=1e-3)
-    curriculum.propose(taught(Mazes(), solvers), P, streams(0, 0, 1))
-    state = curriculum.state_dict()
-    state["scores"]["score"] = torch.eye(BINS)[:2]
-    curriculum.load_state_dict(state)
-    expected = torch.full((2, BINS), 0.3 / BINS) + 0.7 * torch.eye(BINS)[:2]
-    torch.testing.assert_close(curriculum.shares(), expected)

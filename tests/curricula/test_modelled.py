@@ -29,8 +29,6 @@ from tests.tiny import TASK, composed, sledges, tiny_view_task
 
 ASKS_THE_MODEL_ALONE = [
     ["+method=model_transport"],
-    ["+method=first_order_sampled"],
-    ["+method=first_order_proposer_sampled"],
     ["+method=domain_randomization", "+filter=model"],
     ["+method=learning_progress", "+source=model"],
     ["+method=ncc", "+source=model"],

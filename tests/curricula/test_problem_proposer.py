@@ -12,11 +12,9 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from proposer_rl.curricula import (
-    Batch,
     Curriculum,
     Filtered,
     FirstOrderProposer,
-    SampledFirstOrderProposer,
     Student,
 )
 from proposer_rl.learning import DivergedError, PPOSettings
@@ -156,77 +154,3 @@ def test_several_solvers_are_refused() -> None:
     task = Seen(2, WANTED)
     with pytest.raises(ValueError, match="a Proposer learns from one Solver, got 2"):
         proposer(task).propose(Student(), P, [Streams(0), Streams(1)])
-
-
-def sampled(**settings: Any) -> SampledFirstOrderProposer:
-    """On bins in a row."""
-    task = Seen(1, WANTED)
-    task.space.coordinates = torch.arange(float(BINS)).unsqueeze(1)
-    own = task.space, task.target, agent(), ppo(**settings), torch.ones(BINS)
-    return SampledFirstOrderProposer(*own, probe_levels=2, probes=1, measure="return")
-
-
-# Every level's episodes are aligned as its bin is wanted.
-TAUGHT = Student(
-    probe=lambda levels: torch.ones(1, len(levels), 3),
-    performance=lambda levels, generator: TensorDict({"return": 0.0 * levels}, levels.shape),
-    sampled_direction=lambda rollout, weights: {"weight": torch.ones(1, 1)},
-    sampled_alignment=lambda direction, rollout: TensorDict(
-        {"slope": torch.tensor(WANTED)[rollout["bin"]]}, rollout.batch_size
-    ),
-)
-
-
-def trained(curriculum: Curriculum, update: int) -> Tensor:
-    batch = curriculum.propose(TAUGHT, P, [Streams(0, update)])
-    observed(curriculum, batch)
-    return batch.levels
-
-
-def observed(curriculum: Curriculum, batch: Batch) -> None:
-    shape = batch.levels.shape
-    told = {name: torch.ones(shape) for name in ("return", "success", "steps")}
-    rollout = TensorDict({"bin": batch.levels}, shape)
-    curriculum.observe(TAUGHT, batch, TensorDict({**told, "rollout": rollout}, shape))
-
-
-@pytest.mark.parametrize("times", [1, 3])
-def test_every_problem_that_was_trained_on_is_credited_with_its_episodes(times: int) -> None:
-    curriculum = sampled(epochs=1, entropy_coeff=0.3, max_grad_norm=100.0)
-    expected = copy.deepcopy(curriculum.agent)
-    whole = filtered(curriculum, times)
-    trained(whole, 0)  # there is no direction yet
-    levels = trained(whole, 1)
-    assert_same_weights(curriculum.agent, expected)
-    trained(whole, 2)
-    last = step_by_hand(expected, Streams(0, 1), times, slice(-1, None))
-    assert sorted(levels[0].tolist()) == sorted(last.tolist())
-    assert_same_weights(curriculum.agent, expected)
-
-
-def test_it_learns_from_episodes_what_the_target_needs() -> None:
-    curriculum = sampled()
-    levels = [trained(curriculum, update) for update in range(60)]
-    assert (levels[-1] == 2).float().mean() > 0.8
-    assert curriculum.log()["alignment"] > 0.7
-
-
-def test_parts_of_a_batch_teach_when_they_come_in() -> None:
-    """One level alone does not: there is nothing that it is better than."""
-    curriculum = sampled()
-    trained(curriculum, 0)
-    batch = curriculum.propose(TAUGHT, P, [Streams(0, 1)])
-    weights = copy.deepcopy(curriculum.agent)
-    for update, part in enumerate((slice(0, 1), slice(1, P)), 2):
-        observed(curriculum, Batch(batch.levels[:, part], batch.notes[:, part]))
-        assert_same_weights(curriculum.agent, weights)
-        curriculum.propose(TAUGHT, P, [Streams(0, update)])
-    with pytest.raises(AssertionError):
-        assert_same_weights(curriculum.agent, weights)
-
-
-def test_batches_that_never_come_back_are_given_up() -> None:
-    curriculum = sampled()
-    for update in range(40):
-        curriculum.propose(TAUGHT, P, [Streams(0, update)])
-    assert len(curriculum.state_dict()["drawn"]) <= 32

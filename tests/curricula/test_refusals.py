@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -27,7 +26,6 @@ from proposer_rl.curricula import (
     ReplayCurriculum,
     ReplayRule,
     RowsCurriculum,
-    SampledFirstOrderCurriculum,
     SamplingCurriculum,
     Schedule,
     Scorer,
@@ -82,11 +80,6 @@ REFUSED: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (first_order, {"smoothing": 1.0}, "smoothing=1.0: input should be less than 1"),
     (first_order, {"candidates": 0}, "candidates=0: input should be greater"),
     (first_order, {"measure": "luck"}, "measure='luck': input should be 'log_success' or 'return'"),
-    (
-        partial(SampledFirstOrderCurriculum, SPACE, TASK.target_shares),
-        {"exploration": 2},
-        "exploration=2: input should be less than or equal to 1",
-    ),
     (proposer, {"step": -1.0}, "step=-1.0: input should be greater than 0"),
     (proposer, {"target_levels": 0}, "target_levels=0: input should be greater"),
     (selection, {"keep": 17}, "keep=17: must be at most candidates=16"),
@@ -162,12 +155,6 @@ def test_what_bins_cost_or_lack_is_told_first() -> None:
     assert seeds.shares(seeds).tolist() == [1.0]
     with pytest.raises(ArgumentError, match=r"5,000 bins: .* on more than 256"):
         TransportCurriculum(many, torch.ones(5000))
-    with pytest.raises(ArgumentError, match="5,000 bins: at most 4,096"):
-        SampledFirstOrderCurriculum(many, torch.ones(5000))
-    with pytest.warns(UserWarning, match="5,000 bins with 16 probes each: 80,000 levels"):
-        LearningProgressCurriculum(many)
-    with pytest.warns(UserWarning, match="5,000 bins with 8 candidates each: 40,000 levels"):
-        FirstOrderCurriculum(many, many)
     wide = ParameterSpace({str(axis): intervals(0.0, 1.0, 8) for axis in range(9)})
     for maker in (RowsCurriculum, BoundsCurriculum, BetaSampling, LearningProgressCurriculum):
         with pytest.raises(ArgumentError, match="134,217,728 bins: at most 100,000,000"):
@@ -176,6 +163,3 @@ def test_what_bins_cost_or_lack_is_told_first() -> None:
         BoundsCurriculum(ParameterSpace({str(axis): intervals(0.0, 1.0, 8) for axis in range(6)}))
     with pytest.raises(ValueError, match=r"parameters: .* combinations of their bins"):
         ParameterSpace({str(axis): intervals(0.0, 1.0, 256) for axis in range(8)})
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        LearningProgressCurriculum(many, source="episodes")  # which plays none for it

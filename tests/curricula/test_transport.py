@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from proposer_rl.curricula.transport import (
     TransportCurriculum,
-    interim_target,
     step_towards,
 )
 from proposer_rl.meta.assembly import ProposerSettings
@@ -118,21 +117,6 @@ def test_it_is_solved_whatever_the_shares(part: int) -> None:
         p, left = step_towards(target, now, costs, allowed, generator.choice([0.001, 0.3, 1]))
         assert p.sum() == pytest.approx(1) and (p[~allowed] == 0).all() and (p >= 0).all()
         assert left >= costs[allowed].min(0) @ target - 1e-6
-
-
-def test_the_interim_target_is_as_near_as_the_linear_programs_with_any_reach() -> None:
-    generator = np.random.default_rng(0)
-    places = np.array(list(product(np.linspace(-1, 1, 3), np.linspace(-1, 1, 4))))
-    costs = ((places[:, None] - places) ** 2).sum(-1)
-    for _ in range(20):
-        target, allowed = generator.dirichlet(np.full(12, 0.3)), generator.random(12) < 0.4
-        allowed[generator.integers(12)] = True
-        some = [torch.from_numpy(values) for values in (target, costs, allowed[None])]
-        found = interim_target(*some)[0].numpy()
-        assert (found[~allowed] == 0).all() and found.sum() == pytest.approx(1)
-        _, least = step_towards(target, np.full(12, 1 / 12), costs, allowed, 10.0)
-        _, distance = step_towards(target, found, costs, np.ones(12, bool), 0.0)  # where it stands
-        assert distance == pytest.approx(least, abs=1e-6)
 
 
 def curriculum(task: Any, **options: Any) -> TransportCurriculum:

@@ -1,4 +1,4 @@
-"""``bin/research snr``, ``credit`` and ``conditioning`` as users call them, on short runs."""
+"""``bin/research snr`` and ``conditioning`` as users call them, on short runs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import pytest
 
 from proposer_rl.cli.train import main as train
 from research.conditioning import main as look
-from research.credit import main as credit
 from research.snr import EXPLORATIONS
 from research.snr import main as snr
 from tests.commands import call, trained_run
@@ -22,17 +21,6 @@ SMOKE = ["+scale=smoke", "compute.progress=false", "schedule.keep_checkpoints=2"
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return trained_run(tmp_path_factory.mktemp("runs") / "learnt", "+method=perf_gain", *SMOKE)
-
-
-def test_credit_along_three_directions_at_every_checkpoint(run: Path, tmp_path: Path) -> None:
-    output = tmp_path / "credit.json"
-    few = ["--each", "2", "--episodes", "4", "--output", str(output)]
-    assert call(credit, str(run), *few) == 0
-    rows = json.loads(output.read_text())
-    assert [row["updates"] for row in rows] == [4] * 3 + [6] * 3
-    assert [row["direction"] for row in rows] == ["exact", "target", "interim"] * 2
-    assert [round(row["cosine"], 4) for row in rows[::3]] == [1, 1]
-    assert all(-1 <= row["cosine"] < 0.99 for row in rows if row["direction"] != "exact")
 
 
 @pytest.mark.slow

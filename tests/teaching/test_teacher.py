@@ -628,14 +628,12 @@ def recipe(name: str, **settings: Any) -> Any:
 
 
 NO_TARGET = prl.Parameters({"gravity": (0.0, 1.0)})
-OF_TASKS = ["perf_gain", "task_difficulty", "paired"]
-OF_TASKS += ["first_order_proposer", "first_order_proposer_sampled"]
+OF_TASKS = ["perf_gain", "task_difficulty", "paired", "first_order_proposer"]
 NEEDS = {
     "sfl": r"student with exact_performance: it has no exact_performance\(levels\)",
     "robust_plr": r"student with play: it has no play\(levels, generators\)",
     "accel": "student with play",
     "currot": "student with performance",
-    "first_order_sampled": "student with sampled_direction",
     "pace": "student with gradient_norms",
 }
 UNFIT: list[tuple[Callable[[], Any], type[Exception], str]] = [

@@ -215,7 +215,7 @@ def test_the_tasks_that_come_along(name: str, shape: tuple[int, ...], answers: i
 
 
 METHODS = [
-    "perf_gain", "domain_randomization", "plr", "alp_gmm", "first_order_sampled", "currot",
+    "perf_gain", "domain_randomization", "plr", "alp_gmm", "model_transport", "currot",
     "learning_progress curriculum.source=episodes", "sfl +score=sampled",
     "paired solver.ppo.continue_episodes=false",
 ]  # fmt: skip
