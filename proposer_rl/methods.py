@@ -331,7 +331,7 @@ def proposer(
         settings, make_task = components.workers
         make_env = partial(worker_env, make_task, config, streams, reward)
         replicas = ReplicasInWorkers(learner, make_env, settings)
-    return ProposerTrainer(learner, replicas, config.advance).curriculum(config.own_action)
+    return ProposerTrainer(learner, replicas).curriculum(config.own_action)
 
 
 def task_difficulty(components: Components, checkpoint: str | None = None) -> ProposerCurriculum:

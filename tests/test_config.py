@@ -136,7 +136,6 @@ WRONG = [
         "task.evaluation.evaluator=guess",
         "task.evaluation.evaluator='guess': input should be 'exact' or 'rollout'",
     ),
-    ("proposer.advance=all", "proposer.advance='all': input should be "),
     ("proposer.action.spread=0", "proposer.action.spread=0: input should be greater than 0"),
     ("proposer.action.kind=golden", "proposer.action"),
     ("task.distributions.id.mechanism=x", "mechanism='x': input should be 'uniform' or"),
@@ -264,14 +263,6 @@ WRONG_COMMANDS = [
         "method=target needs a student with exact_performance: GymnasiumTask tells performance by",
     ),
     (["+score=sampled", "+method=sfl"], "+method: must come before +score, or it would undo it"),
-    (
-        ["+method=perf_gain", *SMOKE, "proposer.advance=best", "schedule.cycle_length=5"],
-        "schedule.cycle_length=5 must equal proposer.meta_episode_length=3",
-    ),
-    (
-        ["+method=perf_gain", *SMOKE, "proposer.advance=best", "schedule.updates=7"],
-        "schedule.updates=7 must be a multiple of proposer.meta_episode_length=3",
-    ),
     (
         ["+method=first_order_gain", *SMOKE, "curriculum.measure=luck"],
         "curriculum.measure='luck': input should be 'log_success' or 'return'",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from contextlib import nullcontext
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from signal import SIG_DFL, SIGTERM, signal
@@ -15,11 +14,9 @@ import torch
 from tensordict import TensorDictBase
 
 from proposer_rl.curricula import (
-    Advance,
     Batch,
     Curriculum,
     Filtered,
-    Improvement,
     LearnedCurriculum,
     LearningProgressCurriculum,
     SamplingCurriculum,
@@ -145,10 +142,10 @@ class Costly(LearnedCurriculum):
         self.events.append(("observe",))
         self.observed += 1
 
-    def improve(self, student, streams) -> Improvement:
+    def improve(self, student, streams) -> dict:
         self.events.append(("improve",))
         student.spend(frames=1000, evaluations=100)
-        return Improvement({"own": ["improved"]})
+        return {"own": ["improved"]}
 
     def log(self) -> dict:
         observed, self.observed = self.observed, 0
@@ -214,8 +211,9 @@ def test_an_improvement_that_cost_frames_is_saved_at_once(tmp_path: Path) -> Non
     class Silent(Costly):
         crashes = False
 
-        def improve(self, student, streams) -> Improvement:
-            return replace(super().improve(student, streams), metrics={})
+        def improve(self, student, streams) -> dict:
+            super().improve(student, streams)
+            return {}
 
         def propose(self, student, count, streams) -> Batch:
             if self.crashes:
@@ -279,25 +277,6 @@ def test_levels_that_a_curriculum_shows_are_recorded(tmp_path: Path) -> None:
         assert len(row["levels"]["some"]) == 2 and "picture" in row["levels"]["some"][0]
 
 
-class Jumps(LearnedCurriculum):
-    """Trains the Solver itself: an update of its own takes the cycle's place."""
-
-    def improve(self, student, streams) -> Improvement:
-        levels = TASK.target.sample(P, streams[0].generator("levels"))[None]
-        student._learner.env.set_levels(levels)
-        update = student._learner.update([streams[0].generator("actions")])
-        return Improvement({}, advance=Advance(2, levels, update))
-
-
-def test_an_advance_takes_the_updates_of_its_cycle(tmp_path: Path) -> None:
-    run = experiment(tmp_path, 0, curriculum=Jumps())
-    summary = run.run()
-    assert [row["updates"] for row in read_csv(tmp_path / "metrics.csv")] == [0, 2, 4, 6]
-    assert [row["updates"] for row in read_csv(tmp_path / "training.csv")] == [2, 4, 6]
-    assert summary["updates"] == 6 and run.cycles == 3
-    assert all((entry["step"] == 2 * 3).all() for entry in run.learner.snapshot().values())
-
-
 class Stopped(Costly):
     """A signal comes in the middle of its second improvement."""
 
@@ -308,7 +287,7 @@ class Stopped(Costly):
         self.signals = signals
         self.begun = torch.zeros(())
 
-    def improve(self, student, streams) -> Improvement:
+    def improve(self, student, streams) -> dict:
         # What is begun here must be undone, also what has changed in place.
         self.begun += 1
         levels = TASK.target.sample(P, streams[0].generator("levels"))[None]

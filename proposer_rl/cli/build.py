@@ -142,8 +142,6 @@ def _curriculum(
             "that workers could have; leave compute.collector=single"
             f"{hint if 'vectorization' in config.task else ''}"
         )
-    if config.proposer.advance != "train":
-        _check_cycle(config)
     if config.filter is not None:
         with key("filter"):
             curriculum = filtered(curriculum, config.filter, run)
@@ -151,21 +149,6 @@ def _curriculum(
         with key("model"):
             curriculum = modelled(curriculum, config.model, run)
     return curriculum
-
-
-def _check_cycle(config: RunConfig) -> None:
-    length, episode = config.schedule.cycle_length, config.proposer.meta_episode_length
-    if length != episode:
-        raise ConfigError(
-            f"schedule.cycle_length={length} must equal proposer.meta_episode_length={episode} "
-            f"where proposer.advance={config.proposer.advance}"
-        )
-    if config.schedule.updates % episode:
-        raise ConfigError(
-            f"schedule.updates={config.schedule.updates} must be a multiple of "
-            f"proposer.meta_episode_length={episode} where proposer.advance="
-            f"{config.proposer.advance}: a Solver that becomes a copy has all of its updates"
-        )
 
 
 def _workers(config: RunConfig, task: Task) -> Workers | None:

@@ -25,10 +25,8 @@ from proposer_rl.curricula.buffer import rescore as rescore
 from proposer_rl.curricula.combinators import Filtered as Filtered
 from proposer_rl.curricula.combinators import Mixed as Mixed
 from proposer_rl.curricula.combinators import Schedule as Schedule
-from proposer_rl.curricula.contract import Advance as Advance
 from proposer_rl.curricula.contract import Batch as Batch
 from proposer_rl.curricula.contract import Curriculum as Curriculum
-from proposer_rl.curricula.contract import Improvement as Improvement
 from proposer_rl.curricula.contract import Inbox as Inbox
 from proposer_rl.curricula.contract import LearnedCurriculum as LearnedCurriculum
 from proposer_rl.curricula.contract import outcome_of as outcome_of

@@ -11,7 +11,7 @@ from annotated_types import Interval, Len
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.contract import Batch, Curriculum, Improvement, LearnedCurriculum
+from proposer_rl.curricula.contract import Batch, Curriculum, LearnedCurriculum
 from proposer_rl.curricula.scores import Scorer
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import ArgumentError, NotNegative, Positive, checked
@@ -37,12 +37,10 @@ class Combinator(LearnedCurriculum):
         self.reads = tuple(dict.fromkeys(entry for part in parts for entry in part.reads))
         self.trains_replicas = any(part.trains_replicas for part in self._learned())
 
-    def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
-        """Improves the parts that train something; at most one of them may advance the student."""
-        improvements = [part.improve(student, streams) for part in self._learned()]
-        metrics = {k: value for each in improvements for k, value in each.metrics.items()}
-        advances = [each.advance for each in improvements if each.advance is not None]
-        return Improvement(metrics, advances[-1] if advances else None)
+    def improve(self, student: Student, streams: Sequence[Streams]) -> dict[str, Any]:
+        """Improves the parts that train something."""
+        improved = [part.improve(student, streams) for part in self._learned()]
+        return {key: value for metrics in improved for key, value in metrics.items()}
 
     def log(self) -> dict[str, Any]:
         """Returns the logs of the parts in one; of entries that several have, the last one's."""
@@ -165,12 +163,12 @@ class Schedule(Combinator):
             stage = int(batch.notes["stage"][0, 0])
             self.parts[stage].observe(student, Batch(batch.levels, batch.notes["notes"]), outcome)
 
-    def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
+    def improve(self, student: Student, streams: Sequence[Streams]) -> dict[str, Any]:
         """Improves the stage that the cycle begins with."""
         part = self.parts[self._stage]
         if isinstance(part, LearnedCurriculum):
             return part.improve(student, streams)
-        return Improvement()
+        return {}
 
     @property
     def _stage(self) -> int:

@@ -21,7 +21,7 @@ from __future__ import annotations
 import functools
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -30,7 +30,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.batches import levels_at, packed, restored, saved, unpacked
 from proposer_rl.curricula.student import Student
-from proposer_rl.learning import Update, first_episode_return, first_episode_success
+from proposer_rl.learning import first_episode_return, first_episode_success
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels
 
@@ -181,34 +181,6 @@ class Curriculum:
         """Releases what is held outside of this process."""
 
 
-@dataclass
-class Advance:
-    """Updates of the student that a curriculum made itself, in place of the cycle's.
-
-    Attributes:
-        updates: how many.
-        levels: those of the last one, [K, P].
-        update: the last one's rollout, [K, P, T], and metrics.
-    """
-
-    updates: int
-    levels: Levels
-    update: Update
-
-
-@dataclass
-class Improvement:
-    """The result of what a curriculum did before a cycle.
-
-    Attributes:
-        metrics: as :meth:`Curriculum.log` gives them.
-        advance: None if the student is as it was.
-    """
-
-    metrics: dict[str, Any] = field(default_factory=dict)
-    advance: Advance | None = None
-
-
 class LearnedCurriculum(Curriculum):
     """A curriculum that trains something before a cycle, such as a Proposer or one of its parts.
 
@@ -218,8 +190,8 @@ class LearnedCurriculum(Curriculum):
 
     trains_replicas: bool = False
 
-    def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
-        """Prepares for the next cycle, whose first proposal has not been made.
+    def improve(self, student: Student, streams: Sequence[Streams]) -> dict[str, Any]:
+        """Prepares for the next cycle, and returns metrics of it as :meth:`Curriculum.log` does.
 
         If it raises, :meth:`Curriculum.load_state_dict` and another call may follow.
 
@@ -227,7 +199,7 @@ class LearnedCurriculum(Curriculum):
             student: as it is before the cycle.
             streams: of the cycle, K of them.
         """
-        return Improvement()
+        return {}
 
 
 class Inbox:

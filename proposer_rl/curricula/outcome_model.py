@@ -40,7 +40,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.batches import device_of
 from proposer_rl.curricula.combinators import Combinator
-from proposer_rl.curricula.contract import Batch, Curriculum, Improvement, Inbox
+from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.student import ABILITIES, Student
 from proposer_rl.settings import Positive, checked
 from proposer_rl.streams import Streams
@@ -290,7 +290,7 @@ class Modelled(Combinator):
         super().load_state_dict(state)
         self._first = None
 
-    def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
+    def improve(self, student: Student, streams: Sequence[Streams]) -> dict[str, Any]:
         """Improves the curriculum, with a student whose performance the model predicts."""
         return super().improve(_answering(student, self._predict), streams)
 

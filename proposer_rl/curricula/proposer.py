@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.bins import along_axes
-from proposer_rl.curricula.contract import Advance, Batch, Improvement, LearnedCurriculum
+from proposer_rl.curricula.contract import Batch, LearnedCurriculum
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import PPO, agent_weights, load_agent, located
 from proposer_rl.meta.actions import Actions
@@ -63,18 +63,18 @@ class ProposerCurriculum(LearnedCurriculum):
         self.needs = ("performance", "probe")
         self.trains_replicas = trainer is not None
         if self.trains_replicas:
-            self.needs += ("snapshot", "restore")
+            self.needs += ("snapshot",)
         self._proposed = 0  # batches of this cycle
         self._action: Tensor | None = None
 
-    def improve(self, student: Student, streams: Sequence[Streams]) -> Improvement:
+    def improve(self, student: Student, streams: Sequence[Streams]) -> dict[str, Any]:
         """Draws the levels through which the student is seen, and lets the trainer train."""
         (stream,) = streams
         self._proposed = 0
         if self.trainer is not None:
             return self.trainer.train(student, stream)
         self.view.draw_levels(stream)
-        return Improvement()
+        return {}
 
     @torch.no_grad()
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
@@ -142,20 +142,12 @@ class ProposerTrainer:
         learner: PPO of the Proposer, whose environment is a :class:`SolverTrainingEnv` and whose
             horizon is the number of steps of that environment's episodes.
         replicas: trains the replicas; None for the learner's own environment, in this process.
-        advance: what becomes of the student then: with ``"train"`` it trains on new proposals,
-            with ``"best"`` or ``"random"`` it becomes the replica with the greatest total reward,
-            or any, with its optimiser.
 
     Raises:
         ValueError: for an environment of another kind, or a horizon other than the episode's.
     """
 
-    def __init__(
-        self,
-        learner: PPO,
-        replicas: Replicas | None = None,
-        advance: Literal["train", "best", "random"] = "train",
-    ) -> None:
+    def __init__(self, learner: PPO, replicas: Replicas | None = None) -> None:
         env = learner.env
         if not isinstance(env, SolverTrainingEnv):
             raise ValueError("the Proposer's environment must be a SolverTrainingEnv")
@@ -167,7 +159,6 @@ class ProposerTrainer:
         self.learner = learner
         self.env = env
         self.replicas = replicas or Replicas(learner)
-        self.advance = advance
 
     def curriculum(self, own_action: Literal["sample", "mode"]) -> ProposerCurriculum:
         """Returns the curriculum of this Proposer while it learns."""
@@ -182,7 +173,7 @@ class ProposerTrainer:
             trainer=self,
         )
 
-    def train(self, student: Student, stream: Streams) -> Improvement:
+    def train(self, student: Student, stream: Streams) -> dict[str, Any]:
         """Trains K replicas of the student for an episode, and the Proposer on their rewards."""
         env = self.env
         rollout = self.replicas.roll_out(student.snapshot()[0], stream)
@@ -191,26 +182,12 @@ class ProposerTrainer:
             self.learner.check()
         rewards = rollout["next", "reward"].sum((-2, -1))  # [K]
         replicas = len(rewards)
-        # A replica that the student becomes is the student's own training.
-        trained = replicas - (self.advance != "train")
         student.spend(
-            frames=trained * env.frames_per_update * env.meta_episode_length,
+            frames=replicas * env.frames_per_update * env.meta_episode_length,
             # Every replica after each of its actions, and all of them once at the start.
             evaluations=replicas * (env.steps + 1) * env.view.validation_levels,
         )
-        metrics = self._metrics(rollout, rewards, training)
-        return Improvement(metrics, self._advance(student, rewards, stream))
-
-    def _advance(self, student: Student, rewards: Tensor, stream: Streams) -> Advance | None:
-        if self.advance == "train":
-            return None
-        best = int(rewards.argmax())
-        if self.advance == "random":
-            generator = stream.generator("advance")
-            best = int(torch.randint(len(rewards), (), generator=generator))
-        trained = self.replicas.trained(best)
-        student.restore(trained.solver)
-        return Advance(self.env.meta_episode_length, trained.levels, trained.update)
+        return self._metrics(rollout, rewards, training)
 
     def _metrics(
         self, rollout: TensorDictBase, rewards: Tensor, training: TensorDict

@@ -14,7 +14,6 @@ from tqdm import tqdm
 
 from proposer_rl.curricula import (
     Curriculum,
-    Improvement,
     LearnedCurriculum,
     TaskStudent,
     outcome_of,
@@ -202,19 +201,15 @@ class Experiment:
     def _improve(self) -> None:
         """Begins a cycle: improves the curriculum, and logs the cycle before."""
         spent = self.student.frames
-        outcome = Improvement()
+        metrics: dict[str, Any] = {}
         if isinstance(self.curriculum, LearnedCurriculum):
-            outcome = self._improved(self.curriculum)
-        logged = self._log_cycle(outcome.metrics)
+            metrics = self._improved(self.curriculum)
+        logged = self._log_cycle(metrics)
         self.cycles += 1
-        if outcome.advance is not None:
-            self.updates += outcome.advance.updates
-            self._measure()
-            self._tables.add_training(self.updates, outcome.advance.levels, *outcome.advance.update)
         # Improving can be nearly all of a cycle's work, so it is saved at once.
         self._pause(due=logged or self.student.frames > spent)
 
-    def _improved(self, curriculum: LearnedCurriculum) -> Improvement:
+    def _improved(self, curriculum: LearnedCurriculum) -> dict[str, Any]:
         streams = self._streams("cycle", self.cycles)
         while True:
             before = deepcopy(self._state())  # improving may change a curriculum's state in place

@@ -59,8 +59,6 @@ class ProposerSettings:
         observes: numbers that are observed beside the probes.
         action: what an action means.
         own_action: what the Solver itself trains on: a sample of the policy or its mode.
-        advance: what becomes of the Solver after a meta-episode: it trains by itself, or becomes
-            the best replica, or a random one.
         advantage: against the mean of the other replicas, or by a critic.
         context, hidden: widths of the network.
         ppo: PPO's numbers; the horizon is the number of actions of a meta-episode.
@@ -76,7 +74,6 @@ class ProposerSettings:
     )
     action: Annotated[MixtureSettings | ProblemSettings, BY_KIND] = MixtureSettings()
     own_action: Literal["sample", "mode"] = "mode"
-    advance: Literal["train", "best", "random"] = "train"
     advantage: Literal["leave_one_out", "gae"] = "leave_one_out"
     context: Annotated[int, Ge(1)] = 128
     hidden: Annotated[int, Ge(1)] = 128

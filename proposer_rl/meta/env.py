@@ -168,9 +168,6 @@ class SolverTrainingEnv(EnvBase):
         on_update: called after every update with the number of those that the episode has had,
             e.g. by a progress bar; what it raises ends the episode.
 
-    Attributes:
-        last_training: levels [K, P] of the last update, and its rollout and metrics.
-
     Raises:
         ValueError: if the Solvers are no population, or ``action_repeat`` does not divide L.
         ArgumentError: in a step, if the reward is not one number for each Solver.
@@ -273,7 +270,6 @@ class SolverTrainingEnv(EnvBase):
         with torch.enable_grad(), located(place):
             update = self.solvers.update(generators)
             self.solvers.check(self._replicas.start)
-        self.last_training = (levels, update)
         self._updates += 1
         before, _ = self._seen
         if measure:

@@ -12,13 +12,13 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from functools import partial
 from itertools import cycle
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import BaseCollector
 
-from proposer_rl.learning import PPO, DivergedError, RolloutPolicy, Update
+from proposer_rl.learning import PPO, DivergedError, RolloutPolicy
 from proposer_rl.meta.assembly import ProposerSettings, meta_env
 from proposer_rl.meta.env import SolverTrainingEnv, action_generators
 from proposer_rl.meta.rewards import Reward
@@ -27,33 +27,6 @@ from proposer_rl.models import ActorCritic, own_state, uniform_noise, use_device
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
-
-
-class TrainedReplica(NamedTuple):
-    """One replica at the end of its episode.
-
-    Attributes:
-        solver: its snapshot, batch [1].
-        levels: those of its last update, [1, P].
-        update: the rollout [1, P, T] and the metrics [1] of its last update.
-    """
-
-    solver: TensorDictBase
-    levels: Any
-    update: Update
-
-    def to(self, device: torch.device | str) -> TrainedReplica:
-        """Returns it on another device."""
-        rollout, metrics = self.update
-        update = Update(rollout.to(device), metrics.to(device))
-        return TrainedReplica(self.solver.to(device), self.levels.to(device), update)
-
-
-def taken_out(env: SolverTrainingEnv, index: int) -> TrainedReplica:
-    """Returns one of an environment's Solvers as its last update has left it."""
-    own, (levels, (rollout, metrics)) = slice(index, index + 1), env.last_training
-    update = Update(rollout[own], metrics[own])
-    return TrainedReplica(env.solvers.snapshot()[own], levels[own], update)
 
 
 class Replicas:
@@ -81,10 +54,6 @@ class Replicas:
         self._env.fork(solver, streams)
         replicas = range(self._env.batch_size[0])
         return self._proposer.collect(action_generators(streams, replicas))
-
-    def trained(self, replica: int) -> TrainedReplica:
-        """Returns the replica of this number as the last episode has left it."""
-        return taken_out(self._env, replica)
 
     def close(self) -> None:
         """Ends all processes that it has started; a further episode starts others."""
@@ -163,13 +132,6 @@ class ReplicasInWorkers(Replicas):
         rollout.names = [None, "time"]
         return self._proposer.complete(rollout)
 
-    def trained(self, replica: int) -> TrainedReplica:
-        """Returns the replica of this number as the last episode has left it."""
-        assert self._collector is not None, "there has been no episode"
-        orders = [(replica,)] * len(self._shares)
-        results: list[TrainedReplica | None] = self._collector.map_fn("env.trained", orders)
-        return next(filter(None, results)).to(self._env.device)
-
     def close(self) -> None:
         """Ends the workers; a further episode starts others."""
         collector, self._collector = self._collector, None
@@ -228,13 +190,6 @@ class WorkerEnv(SolverTrainingEnv):
         """Lets the next episodes start from one Solver; see :meth:`SolverTrainingEnv.fork`."""
         self.diverged = None
         super().fork(solver, streams)
-
-    def trained(self, replica: int) -> TrainedReplica | None:
-        """Returns the replica of this number on the CPU; None if another worker has it."""
-        if replica not in self._replicas:
-            return None
-        own = taken_out(self, replica - self._replicas.start).to("cpu")
-        return own._replace(solver=own.solver.consolidate())  # one thing to send, not hundreds
 
     @own_state()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -134,18 +134,14 @@ class Training:
 
     def cycle(self, length: int) -> None:
         """An improvement, and the updates that the Solver has to the next."""
-        end = self.count + length
         self.improve()
-        self.updates(end - self.count)
+        self.updates(length)
 
     def improve(self) -> None:
-        """What comes before a cycle; the Solver may have become a copy that made its updates."""
-        streams = [Streams(0, "cycle", self.count)]
-        advance = None
+        """What comes before a cycle."""
         if isinstance(self.curriculum, LearnedCurriculum):
-            advance = self.curriculum.improve(self.student, streams).advance
+            self.curriculum.improve(self.student, [Streams(0, "cycle", self.count)])
         self.curriculum.log()
-        self.count += 0 if advance is None else advance.updates
 
     def updates(self, count: int = STRETCH) -> None:
         """The next updates."""

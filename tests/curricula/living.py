@@ -51,7 +51,7 @@ def live(
             streams = [Streams(seed, "cycle", number) for seed in seeds]
             metrics = {}
             if isinstance(curriculum, LearnedCurriculum):
-                metrics = curriculum.improve(taught, streams).metrics
+                metrics = curriculum.improve(taught, streams)
             lived.told.append({**curriculum.log(), **metrics})
         taught.frames, taught.evaluations = 0, 0
         streams = [Streams(seed, "update", number) for seed in seeds]

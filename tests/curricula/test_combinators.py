@@ -16,7 +16,6 @@ from proposer_rl.curricula import (
     Batch,
     Curriculum,
     Filtered,
-    Improvement,
     Inbox,
     LearnedCurriculum,
     Mixed,
@@ -154,9 +153,9 @@ class Noted(LearnedCurriculum):
         assert (batch.notes["own"] == batch.levels).all()
         self.seen += [batch.levels[0].tolist(), outcome["return"][0].tolist()]
 
-    def improve(self, student: Student, streams: Any) -> Improvement:
+    def improve(self, student: Student, streams: Any) -> dict[str, Any]:
         self.improved += 1
-        return Improvement({"improved": self.first})
+        return {"improved": self.first}
 
     def log(self) -> dict[str, Any]:
         return {"seen": list(self.seen)}
@@ -194,7 +193,7 @@ def test_a_schedule_changes_at_the_exact_batch_and_gives_back_to_whom_it_came_fr
             stages = [Noted(10 * i) for i in range(3)]
             curriculum = Schedule(stages, until=[2, 3])
             curriculum.load_state_dict(state)
-        improved = curriculum.improve(Student(), [Streams(0)]).metrics
+        improved = curriculum.improve(Student(), [Streams(0)])
         batches.append(curriculum.propose(Student(), 2, [Streams(0)]))
         assert improved == {"improved": int(batches[-1].levels[0, 0])}
     assert [int(batch.levels[0, 0]) for batch in batches] == [0, 0, 10, 20, 20]

@@ -19,7 +19,6 @@ from proposer_rl.tasks.mazes import MazeEnv, generate_levels
 from research.benchmarks import worker
 from research.benchmarks.__main__ import main
 from research.benchmarks.ceiling import convolutions
-from research.benchmarks.curricula import Training
 from research.benchmarks.environment import bare_dynamics, draw_actions, through_torchrl
 from research.benchmarks.gymnasium import Trained, read_rows, write_rows
 from research.benchmarks.memory import peak_memory
@@ -142,17 +141,6 @@ def test_methods_of_runs_are_timed_in_turns(
     timing = read_timing([tmp_path / "bench.json"])
     assert set(timing.seconds) == {"domain_randomization", "perf_gain"}
     assert timing.machine.endswith(", threads: 1")
-
-
-def test_a_cycle_has_its_updates_also_where_the_solver_becomes_a_copy() -> None:
-    """It has those of the copy then, and trains on no proposals of its own."""
-    for advance, proposals in {"train": 3, "best": 0}.items():
-        made = TINY.but(f"proposer.advance={advance}").made(TRIED)
-        training, asked = Training(made), []
-        propose = made.curriculum.propose
-        made.curriculum.propose = lambda *given: asked.append(1) or propose(*given)  # noqa: B023
-        training.cycle(3)
-        assert (training.count, len(asked)) == (3, proposals)
 
 
 def test_runs_that_cannot_be_timed_get_one_line(bench, capsys, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from tests.tiny import composed
 COPIES = 3
 OVERRIDES = ["+method=perf_gain", "+scale=smoke", f"proposer.rollouts={COPIES}"]
 # Three actions for each copy: the Proposer's forward pass is over all copies, wherever it is made.
-OVERRIDES += ["proposer.advance=best", "proposer.action_repeat=1", "compute.threads=1"]
+OVERRIDES += ["proposer.action_repeat=1", "compute.threads=1"]
 
 
 def config(*overrides: str) -> RunConfig:
@@ -54,16 +54,18 @@ def cycles(
     count: int = 2,
     between: Callable[[], None] = lambda: None,
 ) -> tuple[list[Any], list[float]]:
-    """What comes of cycles in which the Solver becomes the best copy: choices, and numbers."""
+    """What comes of cycles before each of which the Solver has trained: choices, and numbers."""
     assert curriculum.trainer is not None
     solver = task.learner([Streams(0, "solver")])
     chosen: list[Any] = []
     numbers: list[float] = []
     for cycle in range(count):
         student = TaskStudent(task, solver)
-        outcome = curriculum.improve(student, [Streams(0, "cycle", cycle)])
-        assert outcome.advance is not None
-        metrics, levels, update = outcome.metrics, outcome.advance.levels, outcome.advance.update
+        metrics = curriculum.improve(student, [Streams(0, "cycle", cycle)])
+        stream = Streams(0, "update", cycle)
+        levels = curriculum.propose(student, task.batch_size, [stream]).levels
+        solver.env.set_levels(levels)
+        update = solver.update([stream.generator("actions")])
         chosen += [metrics.pop("histogram"), student.frames, student.evaluations, metrics.keys()]
         chosen += [levels.to_text(), update.rollout["action"].tolist()]
         for value in metrics.values():
