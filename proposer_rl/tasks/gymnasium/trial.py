@@ -13,7 +13,6 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.passive_env_checker import check_action_space, check_observation_space
 
-from proposer_rl.models import callers_state
 from proposer_rl.task import named
 from proposer_rl.tasks.gymnasium.answers import (
     ROUNDING,
@@ -43,7 +42,6 @@ SHORT = 64  # steps of an episode in which levels are compared
 RESETS = 3  # after which a level must still be there
 
 
-@callers_state()
 def tried(
     make: MakeEnvironment,
     parameters: Mapping[str, ParameterSettings],
