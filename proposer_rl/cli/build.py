@@ -19,7 +19,7 @@ from proposer_rl.learning import PPO, SolverSettings
 from proposer_rl.meta.replicas import shares
 from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.methods import Components, ProposerError, Workers, filtered, make, modelled
-from proposer_rl.models import available_cores, own_state, use_device
+from proposer_rl.models import available_cores, check_torch_defaults, use_device
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.process import Status, StopSignals, memory
 from proposer_rl.streams import Streams
@@ -79,8 +79,10 @@ def make_task(config: RunConfig) -> Task:
     context = ComputeContext(
         device, config.precision, compute.cores, compute.graphs, compute.compile
     )
+    check_torch_defaults()
     with key("task", "task."):
         task: Task = _made(task_maker(config.task), config.solver, context, str(device))
+    check_torch_defaults()  # an environment's module may have set them as it was imported
     if task.device.type != device.type:
         warnings.warn(
             f"this run is computed on {task.device.type} instead of {device.type}, since that is "
@@ -113,8 +115,7 @@ def _check_memory(learner: PPO) -> None:
 def _made(maker: partial[Any], solver: SolverSettings, context: ComputeContext, device: str) -> Any:
     """Returns the task on a device; workers call it, too."""
     use_device(torch.device(device))
-    with own_state():  # also after whatever a module of one's own sets as it is imported
-        return maker(solver=solver, context=context._replace(device=torch.device(device)))
+    return maker(solver=solver, context=context._replace(device=torch.device(device)))
 
 
 def _curriculum(

@@ -16,7 +16,6 @@ from rich.table import Table
 from rich.text import Text
 
 from proposer_rl.cli.stored import Stage, StoredRun, stored_run, write_rows
-from proposer_rl.models import own_state
 from proposer_rl.report.tables import to_csv
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.task import LevelResult
@@ -68,7 +67,6 @@ def load(checkpoint: Path) -> tuple[StoredRun, Stage]:
     return run, run.stage(checkpoint if checkpoint.is_file() else None)
 
 
-@own_state()
 def evaluate(
     loaded: tuple[StoredRun, Stage], name: str | None, max_steps: int | None = None
 ) -> Evaluation:

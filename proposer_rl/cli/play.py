@@ -40,7 +40,6 @@ def _run(options: argparse.Namespace) -> None:
             f"bin/play needs {' and '.join(missing)}; install with: {install_command('play')}"
         )
     session = open_session(options.run)
-    from proposer_rl.models import own_state
     from proposer_rl.play.server import application, listen, server
 
     token = secrets.token_urlsafe()
@@ -48,7 +47,7 @@ def _run(options: argparse.Namespace) -> None:
         listening = listen(options.port)
     except OSError as error:
         raise ConfigError(f"--port {options.port}: {error.strerror}") from error
-    with own_state(), listening, suppress(KeyboardInterrupt):
+    with listening, suppress(KeyboardInterrupt):
         address = f"http://127.0.0.1:{listening.getsockname()[1]}/{token}/"
         print(f"Open {address} in a browser on this machine; Ctrl-C ends it.", flush=True)
         if options.open:

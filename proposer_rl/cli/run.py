@@ -32,7 +32,6 @@ from proposer_rl.cli.loggers import log_of, logger
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import DivergedError
 from proposer_rl.meta.workers import WorkersError
-from proposer_rl.models import own_state
 from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, override_value
 from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
 from proposer_rl.runs.folder import PROPOSER, RunFolder, read_bounded, storage, write_atomically
@@ -87,7 +86,7 @@ def train(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> 
         raise
 
 
-@own_state()
+@torch.inference_mode(False)  # also where it is called without gradients
 def carry_out(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> float:
     """Makes the parts of an experiment, and runs it in a folder that it locks meanwhile.
 

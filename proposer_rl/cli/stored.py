@@ -13,7 +13,6 @@ from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import RunConfig, saved_config
 from proposer_rl.cli.errors import ConfigError
 from proposer_rl.learning import PPO
-from proposer_rl.models import own_state
 from proposer_rl.runs.checkpoint import (
     CheckpointError,
     checkpoint_files,
@@ -46,7 +45,6 @@ class StoredRun(NamedTuple):
     task: Task
     files: list[Path]  # its checkpoints, oldest first; at least one
 
-    @own_state()
     def stage(self, file: Path | None = None) -> Stage:
         """Returns the Solvers in one of the files; None stands for the newest intact one."""
         found = load_latest(self.files[-1].parent) if file is None else load_checkpoint(file)
@@ -62,7 +60,6 @@ class StoredRun(NamedTuple):
             ) from error
 
 
-@own_state()
 def stored_run(path: Path) -> StoredRun:
     """Returns a run that has checkpoints.
 

@@ -283,6 +283,33 @@ def at_hand(tensor: Tensor) -> bool:
     return tensor.device.type == "cpu"
 
 
+class TorchDefaultsError(ValueError):
+    """A default of torch's is set under which numbers would differ; the message is one line."""
+
+    exit_code = 2
+
+
+def check_torch_defaults() -> None:
+    """Refuses a default dtype other than float32, and a default device other than the CPU.
+
+    Random draws and networks would be others without a word.
+
+    Raises:
+        TorchDefaultsError: naming torch's own setting, and how to put it back.
+    """
+    dtype, device = torch.get_default_dtype(), torch.empty(0).device
+    if dtype != torch.float32:
+        raise TorchDefaultsError(
+            f"torch.get_default_dtype() is {dtype}, and must be torch.float32: put it back with "
+            "torch.set_default_dtype(torch.float32)"
+        )
+    if device.type != "cpu":
+        raise TorchDefaultsError(
+            f"torch.get_default_device() is {device}, and must be cpu: put it back with "
+            "torch.set_default_device(None), or leave the `with torch.device(...)`"
+        )
+
+
 def use_device(device: torch.device) -> None:
     """Makes a GPU the current one, whose fp32 products round their factors to TF32.
 

@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from torch import Tensor
 
-from proposer_rl.models import callers_state, own_state
+from proposer_rl.models import check_torch_defaults
 from proposer_rl.settings import ArgumentError, plain, shown, whole
 from proposer_rl.task import Distribution, Levels, space_features
 from proposer_rl.tasks.parameters import SEED, Bins, Law, ParameterSpace
@@ -87,8 +87,7 @@ class LevelSpace:
         if self._features is None:
             return space_features(self, levels)
         shape = levels.shape
-        with callers_state():
-            known = number_table(self._features(self.given(levels.reshape(-1))))
+        known = number_table(self._features(self.given(levels.reshape(-1))))
         if known.ndim != 2 or len(known) != shape.numel():
             raise ArgumentError(
                 f"features={list(known.shape)}: must give a row of numbers for each of "
@@ -154,7 +153,6 @@ class Parameters(LevelSpace, ParameterSpace):
         (8, True, 'stairs')
     """
 
-    @own_state()
     def __init__(
         self,
         ranges: Ranges,
@@ -164,6 +162,7 @@ class Parameters(LevelSpace, ParameterSpace):
         named: Mapping[str, Ranges] | None = None,
         seeded: bool = False,
     ) -> None:
+        check_torch_defaults()
         _check_names("ranges", ranges, ranges)
         if not ranges:
             raise ArgumentError("ranges={}: must have at least one parameter")
@@ -304,7 +303,6 @@ class Items(LevelSpace):
         (tensor([0, 0, 1]), torch.Size([2, 5]))
     """
 
-    @own_state()
     def __init__(
         self,
         count: int,
@@ -314,6 +312,7 @@ class Items(LevelSpace):
         target: Sequence[int] | None = None,
         named: Mapping[str, Sequence[int]] | None = None,
     ) -> None:
+        check_torch_defaults()
         count = whole("count", count, 1)
         self.size = count
         self.axes = {"item": range(count)}
@@ -474,8 +473,7 @@ class LevelGenerator(LevelSpace):
     def _edits(self, edit: Callable[[Any, int, torch.Generator], Any]) -> Callable[..., Levels]:
         def edited(levels: Levels, count: int, generators: Sequence[torch.Generator]) -> Levels:
             rows = zip(levels, generators, strict=True)
-            with callers_state():
-                made = [(edit(self.given(own), count, g), len(own)) for own, g in rows]
+            made = [(edit(self.given(own), count, g), len(own)) for own, g in rows]
             return torch.stack([_taken("edit", new, n) for new, n in made])
 
         return edited
@@ -493,9 +491,7 @@ class _Drawn:
         self._name, self._draw, self._form = name, draw, form
 
     def sample(self, count: int, generator: torch.Generator) -> Levels:
-        with callers_state():
-            levels = self._draw(count, generator)
-        taken = _taken(self._name, levels, count)
+        taken = _taken(self._name, self._draw(count, generator), count)
         form = {name: [*entry.shape[1:]] for name, entry in taken.items(True, True)}
         if form != (self._form or form):
             raise ArgumentError(f"{self._name}={form}: must give levels of one form, {self._form}")

@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.models import callers_state
 from proposer_rl.settings import ArgumentError
 from proposer_rl.tasks.parameters import ParameterSpace
 from proposer_rl.teaching.spaces import (
@@ -69,8 +68,7 @@ class MadeLevels(Parameters):
     def made(self, values: TensorDictBase, generator: torch.Generator) -> TensorDict:
         """Makes levels [n] of values of the parameters [n], and keeps these beside them."""
         kept = values.select(*self.bins)
-        with callers_state():
-            levels = self._make(kept.clone(), generator)
+        levels = self._make(kept.clone(), generator)
         if not hasattr(levels, "shape") or tuple(levels.shape[:1]) != (len(kept),):
             shape = list(getattr(levels, "shape", ())) or type(levels).__name__
             raise ArgumentError(f"make={shape}: must give {len(kept)} levels, [{len(kept)}, ...]")

@@ -21,7 +21,7 @@ from torch.utils._pytree import tree_map_only
 from proposer_rl.curricula import Batch, Curriculum, Student, require
 from proposer_rl.curricula.batches import CPU, moved, packed
 from proposer_rl.curricula.ledger import OUT, OVER, RETURNED, Block, Ledger
-from proposer_rl.models import own_state
+from proposer_rl.models import check_torch_defaults
 from proposer_rl.recipes import Recipe
 from proposer_rl.runs.folder import storage
 from proposer_rl.settings import ArgumentError, Count, checked, shown, whole
@@ -104,7 +104,7 @@ class Teacher:
     _rows: list[Any]  # its levels one by one, from the first time on
     _moved: Any  # its levels as the loop gets them, likewise
 
-    @own_state()
+    @torch.inference_mode(False)
     @checked
     def __init__(
         self,
@@ -120,6 +120,7 @@ class Teacher:
         student: Student | None = None,
         **can: Any,
     ) -> None:
+        check_torch_defaults()
         self.space, self.device, self.block = space, as_device(device), block
         self._seeds = [whole("seed", seed) + number for number in range(students)]
         self.curriculum, self._made_of = make_curriculum(curriculum, space, filter, self._seeds)
@@ -291,7 +292,7 @@ class Teacher:
                 dropped = len(going)
             self._tally.dropped(dropped)
 
-    @own_state()
+    @torch.inference_mode(False)
     def observe(self, outcome: Any, ids: Any = None) -> None:
         """Takes the outcome of the levels that were proposed, or of those of some tickets.
 
@@ -331,7 +332,7 @@ class Teacher:
             if ids is None:
                 self._whole.clear()
 
-    @own_state()
+    @torch.inference_mode(False)
     def log(self, file: str | os.PathLike[str] | None = None) -> dict[str, Any]:
         """Returns what happened since the last call, and the curriculum's own log.
 
@@ -356,7 +357,7 @@ class Teacher:
                     lines.write(json.dumps(kept) + "\n")
             return record
 
-    @own_state()
+    @torch.inference_mode(False)
     def state_dict(self) -> dict[str, Any]:
         """Returns all that a resumed loop needs, with the tickets that are out."""
         with self._here():
@@ -376,7 +377,7 @@ class Teacher:
                 else {"shape": list(kept.batch_size), "kept": packed(kept)},
             }
 
-    @own_state()
+    @torch.inference_mode(False)
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Puts back what :meth:`state_dict` returned, on whichever device its tensors are.
 
@@ -477,9 +478,10 @@ class Teacher:
             self._tally.count(block.batch.levels[:, some])
             self._counted = self._at
 
-    @own_state()
+    @torch.inference_mode(False)
     def _next(self, count: int) -> Block:
         """Lets the curriculum observe the results there are, and returns what it then proposes."""
+        check_torch_defaults()
         for batch, results in self._ledger.take():
             self.curriculum.observe(self.student, batch, as_outcome(results))
         streams = [Streams(seed, "update", self._proposals) for seed in self._seeds]

@@ -842,14 +842,3 @@ def test_clients_where_the_temporary_folder_has_a_long_name(
     client.tell(ticket, 0.5)
     with pytest.raises(ArgumentError, match="told before"):
         client.tell(ticket, 0.5)
-
-
-def test_clients_change_no_precision_of_the_loop() -> None:
-    client = plr().client()
-    torch.set_default_dtype(torch.float64)
-    try:
-        with pytest.raises(RuntimeError, match=r"default dtype is torch\.float64: a teacher"):
-            client.ask()
-    finally:
-        torch.set_default_dtype(torch.float32)
-    client.ask()

@@ -12,11 +12,14 @@ from gymnasium import spaces
 from gymnasium.wrappers import TransformAction, TransformObservation
 from numpy.typing import NDArray
 
-from proposer_rl.tasks.gymnasium.answers import NUMERIC, UnfitEnvironmentError, check_seen
+from proposer_rl.settings import shown
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
 
 Array = NDArray[Any]
 Env = gymnasium.Env[Any, Any]
 
+# Spaces whose values are one number or an array of them.
+NUMERIC = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
 UNBOUNDED = 1e9  # what a bound of at least this means; no number in use comes near
 IMAGE_SIDE = 16  # pixels at least, of a map of bytes without channels
 NUMBERS_ENTRY = "observation"  # the entry of all numbers, or of the only image
@@ -83,14 +86,22 @@ def _typed(space: Any, seen: Any) -> Array:
     """Returns an observation in the type of its space, of numbers.
 
     Raises:
-        UnfitEnvironmentError: where it has another shape, or a whole number would become another.
+        UnfitEnvironmentError: where it has another shape, or would become another number. A float
+            beyond its bounds does not: nothing here depends on them.
     """
     array = np.asarray(seen)
+    fits = array.shape == space.shape and array.dtype.kind in "biuf"
     # Floats of a box are not looked at one by one: that would take longer than many a step.
     floats = array.dtype.kind == "f" == space.dtype.kind
-    plain = isinstance(space, spaces.Box) and (floats or array.dtype == space.dtype)
-    if not plain or array.shape != space.shape:
-        check_seen(space, seen, "the environment")
+    if fits and not (isinstance(space, spaces.Box) and (floats or array.dtype == space.dtype)):
+        with np.errstate(invalid="ignore"):
+            fits = np.array_equal(array.astype(space.dtype), array)
+        fits = fits and (isinstance(space, spaces.Box) or space.contains(array.astype(space.dtype)))
+    if not fits:
+        raise UnfitEnvironmentError(
+            f"the environment shows {shown(seen)}, {array.dtype} {list(array.shape)}; its "
+            f"observation space is {space}"
+        )
     typed: Array = array.astype(space.dtype, copy=False)
     return typed
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, NoReturn, TypeVar
 import torch
 from torch import Tensor
 
-from proposer_rl.models import own_state
+from proposer_rl.models import check_torch_defaults
 from proposer_rl.tasks.mazes.levels import (
     Level,
     cell_index,
@@ -21,7 +21,6 @@ from proposer_rl.tasks.mazes.levels import (
 Generators = torch.Generator | None | Sequence[torch.Generator]
 
 
-@own_state()
 def generate_levels(
     obstacle_fraction: float | Sequence[float] | Tensor,
     path_length: int | Sequence[int] | Tensor,
@@ -73,6 +72,7 @@ def generate_levels(
         >>> shortest_path_length(levels)
         tensor([3, 5])
     """
+    check_torch_defaults()
     if mechanism not in _MECHANISMS:
         raise ValueError(f"mechanism must be one of {MECHANISMS}, got {mechanism!r}")
     if height < 1 or width < 1:

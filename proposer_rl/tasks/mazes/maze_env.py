@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from proposer_rl.models import own_state, population
+from proposer_rl.models import check_torch_defaults, population
 from proposer_rl.settings import signed
 from proposer_rl.tasks.mazes.levels import (
     MOVES,
@@ -54,6 +54,7 @@ class LevelEnv(EnvBase):
     _constant: Sequence[str] = ()  # observations that stay the same throughout an episode
 
     def __init__(self, levels: Level, max_steps: int) -> None:
+        check_torch_defaults()
         if max_steps < 1:
             raise ValueError(f"max_steps must be at least 1, got {max_steps}")
         super().__init__(
@@ -244,7 +245,6 @@ class MazeEnv(LevelEnv):
         (tensor([0.9900]), tensor([True]))
     """
 
-    @own_state()
     def __init__(
         self,
         levels: Level,

@@ -73,14 +73,6 @@ class PassesOn(Line):
         return getattr(self.inner, name)
 
 
-class Unlike(gym.Wrapper[Any, Any, Any, Any]):
-    """Shows one number more than the space that it says."""
-
-    def reset(self, **given: Any) -> Any:
-        seen, info = self.env.reset(**given)
-        return np.append(seen, 0), info
-
-
 class Grey(Line):
     """Bytes without channels."""
 
