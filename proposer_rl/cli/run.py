@@ -10,32 +10,29 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from signal import Signals
 from typing import Any, Protocol
 
-import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from numpy.typing import NDArray
-from PIL import Image
 
 from proposer_rl.cli.build import Made, build, parts
-from proposer_rl.cli.config import LARGEST_FILE, RunConfig, stored_config
+from proposer_rl.cli.config import RunConfig, stored_config
 from proposer_rl.cli.errors import ConfigError, one_line, say
 from proposer_rl.cli.groups import overrides
 from proposer_rl.cli.help import choices, needs
-from proposer_rl.cli.loggers import log_of, logger
+from proposer_rl.cli.loggers import logger
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import DivergedError
 from proposer_rl.meta.workers import WorkersError
 from proposer_rl.models import own_state
 from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, override_value
 from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
-from proposer_rl.runs.folder import PROPOSER, RunFolder, read_bounded, storage, write_atomically
+from proposer_rl.runs.folder import PROPOSER, RunFolder, storage, write_atomically
 from proposer_rl.runs.process import Interrupted, Status, StopSignals, locked, processor
 from proposer_rl.runs.records import TaskFacts, checked
 
@@ -52,9 +49,6 @@ class Shown(Protocol):
 
     def draw_run(self, folder: Path, title: str) -> Path:
         """Draws the picture of a run that is over; returns its file."""
-
-    def last_map(self, folder: Path) -> NDArray[np.uint8] | None:
-        """Returns the heat map of the last proposals, uint8 [H, W, 3]; None without any."""
 
     def announce(
         self,
@@ -76,8 +70,8 @@ def train(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> 
     try:
         return carry_out(config, path, signals, shown)
     except Interrupted as stop:
-        stopped = f"{one_line(stop).capitalize()}; all is saved"
-        say(f"{stopped}. To go on: {to_go_on(path)}")
+        name = Signals(stop.signum).name
+        say(f"Stopped by {name}; all is saved. To go on: {to_go_on(path)}")
         if "SUBMITIT_EXECUTOR" in os.environ:  # the sweep that sent this job waits for its result
             raise
         sys.exit(stop.exit_code)
@@ -110,6 +104,9 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals, shown: Shown)
         try:
             result = proceed(config, made, path, signals, status, shown)
             signals.deliver()  # of a sweep the next run is not to begin
+        except Interrupted as stop:
+            stop.folder = path
+            raise
         except WorkersError as error:
             raise WorkersError(f"compute.{error}") from error
         finally:
@@ -130,8 +127,7 @@ def proceed(
     if finished is not None:
         say(f"{run_name(config)}: finished before, nothing to do. Files: {path}")
         return finished
-    with logger(config.logger, path, run_name(config), asdict(config)) as write:
-        log = None if write is None else log_of(write, partial(shown.last_map, path))
+    with logger(config.logger, path, run_name(config), asdict(config)) as log:
         experiment = build(config, made, folder, signals, status, log)
         facts = identity(experiment, config)
         described = {"planned_updates": config.schedule.updates, "task": made.task.facts}
@@ -150,9 +146,6 @@ def proceed(
             write_atomically(path / PROPOSER, content)
         folder.write_json(SUMMARY, {**facts, **result})
         picture = shown.draw_run(path, run_name(config))
-        if write is not None:
-            with Image.open(picture) as image:
-                write({}, {"run": np.asarray(image.convert("RGB"))}, experiment.updates)
     shown.announce(config.method, config.seeds, result, path, picture)
     return result
 
@@ -171,7 +164,7 @@ def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
             raise ConfigError(f"{wrong} has made {made} updates already")
         return None
     try:
-        summary: dict[str, Any] = json.loads(read_bounded(file, LARGEST_FILE))
+        summary: dict[str, Any] = json.loads(file.read_bytes())
         ended = int(summary["updates"])
     except (ValueError, TypeError, KeyError) as error:
         raise ConfigError(
