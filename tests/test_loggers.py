@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import proposer_rl
 from proposer_rl.cli.config import LoggerSettings
 from proposer_rl.cli.errors import ConfigError
 from proposer_rl.cli.loggers import logger, require_logger
@@ -18,6 +20,7 @@ from proposer_rl.runs.folder import read_csv, read_jsonl
 from tests import commands
 from tests.processes import Processes
 
+BLOCK = 2**15  # bytes, of a file of Weights & Biases
 LITTLE = [*commands.SMOKE, "schedule.checkpoint_every=2", "schedule.updates=6"]
 SMOKE = ["+method=target", "+scale=smoke", "compute.progress=false", "hydra.run.dir=run"]
 
@@ -151,23 +154,48 @@ def test_what_is_given_goes_before_the_variables_of_weights_and_biases(
 
 
 def records(folder: Path) -> Iterator[Any]:
-    """What Weights & Biases has written of a run without a network."""
+    """What Weights & Biases has written of a run without a network, in LevelDB's format of logs."""
     from wandb.proto.wandb_internal_pb2 import Record
-    from wandb.sdk.internal.datastore import DataStore
 
     (file,) = folder.glob("*.wandb")
-    store = DataStore()
-    store.open_for_scan(str(file))
-    while (data := store.scan_data()) is not None:
-        yield Record.FromString(data)
+    content, at, data = file.read_bytes(), 7, b""
+    while at + 7 <= len(content):
+        if (left := BLOCK - at % BLOCK) < 7:
+            at += left
+            continue
+        length, kind = struct.unpack("<HB", content[at + 4 : at + 7])
+        at += 7 + length
+        data += content[at - length : at]
+        if kind in (1, 4):  # whole, or the last part of one
+            yield Record.FromString(data)
+            data = b""
 
 
-@pytest.mark.usefixtures("own_folder")
-def test_a_run_that_goes_on_is_the_same_at_weights_and_biases(train, monkeypatch) -> None:
-    """With the package itself, where it is installed."""
-    pytest.importorskip("wandb")
+@pytest.fixture
+def offline(own_folder: None, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The package itself, where it is installed, without a network."""
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
+    return pytest.importorskip("wandb")
+
+
+def test_a_run_of_the_callers_own_at_weights_and_biases_goes_on(offline: Any) -> None:
+    own = offline.init(project="own")
+    little = {"logger": {"type": "wandb"}, "solver": {"ppo": {"horizon": 5, "epochs": 1}}}
+    for seed in (0, 1):
+        task = proposer_rl.tasks.maze()
+        folder = Path(f"run_{seed}")
+        options = {"scale": "smoke", "updates": 1, "seed": seed, "settings": little}
+        proposer_rl.train(task, "target", folder=folder, progress=False, **options)
+        assert offline.run is own and own.id != (folder / "wandb_id.txt").read_text()
+        own.log({"seed": seed})
+    own.finish()
+    (folder,) = Path("wandb").glob("offline-run-*")
+    assert sum(record.HasField("history") for record in records(folder)) == 2
+
+
+@pytest.mark.usefixtures("offline")
+def test_a_run_that_goes_on_is_the_same_at_weights_and_biases(train) -> None:
     for updates in (4, 6):
         assert train(*SMOKE, "logger=wandb", "seed=3", f"schedule.updates={updates}") == 0
     folders = sorted(Path("run/wandb").glob("offline-run-*"), key=lambda one: one.stat().st_mtime)
