@@ -287,5 +287,5 @@ def _sync_folder(folder: Path) -> None:
         warnings.warn(
             f"folders cannot be synced here ({error.strerror}): all files are written and synced, "
             "but if the machine crashes, the newest may lack their names",
-            stacklevel=2,
+            stacklevel=1,  # told once, whoever writes
         )
