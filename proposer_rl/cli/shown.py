@@ -1,4 +1,4 @@
-"""What a run shows, and a sweep when it is over: it is read from their folders.
+"""The picture and the lines with which a run ends, and the table with which a sweep does.
 
 Training is given this module and knows nothing of what draws; figures take a while to import.
 """
@@ -11,14 +11,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
-from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import Console
 
 from proposer_rl.cli.errors import say
-from proposer_rl.report.terminal import find_progress, overview, read_progress
+from proposer_rl.report.terminal import find_progress, overview
 from proposer_rl.runs.folder import FAILURE, is_rate
 from proposer_rl.runs.records import level_text
 
@@ -56,12 +54,7 @@ def draw_run(folder: Path, title: str) -> Path:
 def announce(
     method: str, seeds: Sequence[int], result: Mapping[str, Any], folder: Path, picture: Path
 ) -> None:
-    """Prints the results; with the run's row and curve, unless it is part of a sweep."""
-    if HydraConfig.get().mode != RunMode.MULTIRUN:
-        console = Console()
-        with console.capture() as printed:
-            console.print(overview([read_progress(folder)]))
-        say(printed.get().removesuffix("\n"))
+    """Prints the results."""
     for seed, reached, final in zip(
         seeds, result["updates_to_threshold"], result["final"], strict=True
     ):

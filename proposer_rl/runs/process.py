@@ -178,6 +178,8 @@ def _shield_tracker() -> None:
     Slurm signals every process of a step. The tracker, which tqdm's lock brings, would die of most,
     and its successor complain in tracebacks of what it does not know.
     """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows, which has no such tracker
+        return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     try:
         resource_tracker.ensure_running()
