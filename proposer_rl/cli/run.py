@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import shlex
@@ -34,7 +33,7 @@ from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, override_value
 from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
 from proposer_rl.runs.folder import PROPOSER, RunFolder, storage, write_atomically
 from proposer_rl.runs.process import Interrupted, Status, StopSignals, locked, processor
-from proposer_rl.runs.records import TaskFacts, checked
+from proposer_rl.runs.records import TaskFacts, checked, small_json
 
 SUMMARY = "summary.json"
 # What may differ: where it is computed and shown, and a longer schedule.
@@ -157,24 +156,18 @@ def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
     """
     file, checkpoints = folder / SUMMARY, folder / "checkpoints"
     wrong = f"schedule.updates={updates}: the run in {folder}"
-    if not file.exists():
+    summary: dict[str, Any] | None = small_json(file)
+    if summary is None:
         latest = load_latest(checkpoints)
         made = 0 if latest is None else latest[1].get("updates")
         if isinstance(made, int) and made > updates:
             raise ConfigError(f"{wrong} has made {made} updates already")
         return None
-    try:
-        summary: dict[str, Any] = json.loads(file.read_bytes())
-        ended = int(summary["updates"])
-    except (ValueError, TypeError, KeyError) as error:
-        raise ConfigError(
-            f"{file}: is damaged; remove it to go on from the last checkpoint"
-        ) from error
-    if ended >= updates:
+    if summary["updates"] >= updates:
         return summary
     if not checkpoint_files(checkpoints):
         raise ConfigError(
-            f"{wrong} ended after {ended} updates and has no checkpoint to go on from"
+            f"{wrong} ended after {summary['updates']} updates and has no checkpoint to go on from"
         )
     with storage(file):
         file.unlink()
