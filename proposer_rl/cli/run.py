@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import shlex
@@ -10,33 +9,30 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from signal import Signals
 from typing import Any, Protocol
 
-import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from numpy.typing import NDArray
-from PIL import Image
 
 from proposer_rl.cli.build import Made, build, parts
-from proposer_rl.cli.config import LARGEST_FILE, RunConfig, stored_config
+from proposer_rl.cli.config import RunConfig, stored_config
 from proposer_rl.cli.errors import ConfigError, one_line, say
 from proposer_rl.cli.groups import overrides
 from proposer_rl.cli.help import choices, needs
-from proposer_rl.cli.loggers import log_of, logger
+from proposer_rl.cli.loggers import logger
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import DivergedError
 from proposer_rl.meta.workers import WorkersError
 from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, override_value
 from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
-from proposer_rl.runs.folder import PROPOSER, RunFolder, read_bounded, storage, write_atomically
+from proposer_rl.runs.folder import PROPOSER, RunFolder, storage, write_atomically
 from proposer_rl.runs.process import Interrupted, Status, StopSignals, locked, processor
-from proposer_rl.runs.records import TaskFacts, checked
+from proposer_rl.runs.records import TaskFacts, checked, small_json
 
 SUMMARY = "summary.json"
 # What may differ: where it is computed and shown, and a longer schedule.
@@ -51,9 +47,6 @@ class Shown(Protocol):
 
     def draw_run(self, folder: Path, title: str) -> Path:
         """Draws the picture of a run that is over; returns its file."""
-
-    def last_map(self, folder: Path) -> NDArray[np.uint8] | None:
-        """Returns the heat map of the last proposals, uint8 [H, W, 3]; None without any."""
 
     def announce(
         self,
@@ -75,8 +68,8 @@ def train(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> 
     try:
         return carry_out(config, path, signals, shown)
     except Interrupted as stop:
-        stopped = f"{one_line(stop).capitalize()}; all is saved"
-        say(f"{stopped}. To go on: {to_go_on(path)}")
+        name = Signals(stop.signum).name
+        say(f"Stopped by {name}; all is saved. To go on: {to_go_on(path)}")
         if "SUBMITIT_EXECUTOR" in os.environ:  # the sweep that sent this job waits for its result
             raise
         sys.exit(stop.exit_code)
@@ -109,6 +102,9 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals, shown: Shown)
         try:
             result = proceed(config, made, path, signals, status, shown)
             signals.deliver()  # of a sweep the next run is not to begin
+        except Interrupted as stop:
+            stop.folder = path
+            raise
         except WorkersError as error:
             raise WorkersError(f"compute.{error}") from error
         finally:
@@ -129,8 +125,7 @@ def proceed(
     if finished is not None:
         say(f"{run_name(config)}: finished before, nothing to do. Files: {path}")
         return finished
-    with logger(config.logger, path, run_name(config), asdict(config)) as write:
-        log = None if write is None else log_of(write, partial(shown.last_map, path))
+    with logger(config.logger, path, run_name(config), asdict(config)) as log:
         experiment = build(config, made, folder, signals, status, log)
         facts = identity(experiment, config)
         described = {"planned_updates": config.schedule.updates, "task": made.task.facts}
@@ -149,9 +144,6 @@ def proceed(
             write_atomically(path / PROPOSER, content)
         folder.write_json(SUMMARY, {**facts, **result})
         picture = shown.draw_run(path, run_name(config))
-        if write is not None:
-            with Image.open(picture) as image:
-                write({}, {"run": np.asarray(image.convert("RGB"))}, experiment.updates)
     shown.announce(config.method, config.seeds, result, path, picture)
     return result
 
@@ -163,24 +155,18 @@ def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
     """
     file, checkpoints = folder / SUMMARY, folder / "checkpoints"
     wrong = f"schedule.updates={updates}: the run in {folder}"
-    if not file.exists():
+    summary: dict[str, Any] | None = small_json(file)
+    if summary is None:
         latest = load_latest(checkpoints)
         made = 0 if latest is None else latest[1].get("updates")
         if isinstance(made, int) and made > updates:
             raise ConfigError(f"{wrong} has made {made} updates already")
         return None
-    try:
-        summary: dict[str, Any] = json.loads(read_bounded(file, LARGEST_FILE))
-        ended = int(summary["updates"])
-    except (ValueError, TypeError, KeyError) as error:
-        raise ConfigError(
-            f"{file}: is damaged; remove it to go on from the last checkpoint"
-        ) from error
-    if ended >= updates:
+    if summary["updates"] >= updates:
         return summary
     if not checkpoint_files(checkpoints):
         raise ConfigError(
-            f"{wrong} ended after {ended} updates and has no checkpoint to go on from"
+            f"{wrong} ended after {summary['updates']} updates and has no checkpoint to go on from"
         )
     with storage(file):
         file.unlink()

@@ -1,4 +1,4 @@
-"""What a run shows, and a sweep when it is over: it is read from their folders.
+"""The picture and the lines with which a run ends, and the table with which a sweep does.
 
 Training is given this module and knows nothing of what draws; figures take a while to import.
 """
@@ -11,16 +11,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
-from hydra.types import RunMode
-from numpy.typing import NDArray
 from omegaconf import DictConfig
 from rich.console import Console
 
 from proposer_rl.cli.errors import say
-from proposer_rl.report.terminal import find_progress, overview, read_progress, screen
+from proposer_rl.report.terminal import find_progress, overview
 from proposer_rl.runs.folder import FAILURE, is_rate
 from proposer_rl.runs.records import level_text
 
@@ -55,22 +51,10 @@ def draw_run(folder: Path, title: str) -> Path:
     return figures.draw_run(folder, title)
 
 
-def last_map(folder: Path) -> NDArray[np.uint8] | None:
-    """Returns the heat map of a run's last proposals, uint8 [H, W, 3]; None where it has none."""
-    from proposer_rl.report import figures
-
-    return figures.last_map(folder)
-
-
 def announce(
     method: str, seeds: Sequence[int], result: Mapping[str, Any], folder: Path, picture: Path
 ) -> None:
-    """Prints the results; with a screen of the run, unless it is part of a sweep."""
-    if HydraConfig.get().mode != RunMode.MULTIRUN:
-        console = Console()
-        with console.capture() as printed:
-            console.print(screen(read_progress(folder)))
-        say(printed.get().removesuffix("\n"))
+    """Prints the results."""
     for seed, reached, final in zip(
         seeds, result["updates_to_threshold"], result["final"], strict=True
     ):

@@ -31,7 +31,7 @@ from proposer_rl.cli.errors import UNFORESEEN, ConfigError, command, exit_code, 
 from proposer_rl.cli.groups import check_chosen, check_groups, explained, overrides
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.folder import FAILURE, RunFolder
-from proposer_rl.runs.process import InUseError, StopSignals
+from proposer_rl.runs.process import InUseError, StopSignals, guard_output
 
 LONGEST = 300  # characters of what is said of a lost job
 HYDRAS_OWN = {".hydra", "train.log", "multirun.yaml"}
@@ -98,6 +98,7 @@ def _compose_and_run() -> None:
 
 @hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="train")
 def _main(hydra_config: DictConfig) -> float:
+    guard_output()  # launchers start processes that begin here
     BEGUN.append(path := Path(HydraConfig.get().runtime.output_dir))
     signals = StopSignals()
     try:
