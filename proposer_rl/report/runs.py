@@ -38,7 +38,7 @@ OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_n
 _STUDENT = re.compile(r"lifetime_(\d{1,9})")
 STUDY = "runs.csv.xz"  # what makes a folder a study's
 NAMES = ("metrics", "training", "cycles", "levels")
-LARGEST_FILE = 64 * 2**20  # bytes, unpacked
+LARGEST_FILE = 64 * 2**20  # bytes of pictures that are read
 
 
 @dataclass(frozen=True)
