@@ -228,12 +228,15 @@ def test_what_hydra_cannot_read_is_named(override: str, train, capsys) -> None:
     assert len(error.splitlines()) == 1 and "https" not in error
 
 
-def test_an_error_of_ours_within_a_run_is_no_bad_input(train, monkeypatch) -> None:
+@pytest.mark.parametrize("error", [ValueError("a bug"), BrokenPipeError(32, "a lost process")])
+def test_an_unforeseen_error_within_a_run_is_no_bad_input_and_none_of_the_disk(
+    error: Exception, train, monkeypatch
+) -> None:
     def broken(*_: object) -> float:
-        raise ValueError("a bug")
+        raise error
 
     monkeypatch.setattr("proposer_rl.cli.run.train", broken)
-    with pytest.raises(ValueError, match="a bug"):
+    with pytest.raises(type(error), match=r"a bug|a lost process"):
         train("+method=target", *SMOKE, "hydra.run.dir=run")
 
 
