@@ -257,6 +257,12 @@ def over_tasks(compared: arena.Arena, figures: str) -> str:
     )
 
 
+def of_teachers(drawings: Sequence[Drawing], notes: Sequence[str], figures: str) -> str:
+    """Returns the Markdown on logs of teachers: notes and figures."""
+    pictures = [f"![{escape_markdown(one.title)}]({figures}{one.name}.png)" for one in drawings]
+    return "\n\n".join(["## Logs of teachers", *map(escape_markdown, notes), *pictures])
+
+
 def _tables(tables: Iterable[Table]) -> list[str]:
     parts = []
     for table in tables:

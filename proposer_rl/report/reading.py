@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import json
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -221,8 +220,11 @@ def _optional(file: Path, read: Callable[[Path], list[Any]]) -> list[Any]:
 
 
 def _read_json(file: Path) -> dict[str, Any]:
-    # Editors of Windows put a mark in front.
-    return checked(dict[str, Any], file.read_bytes().removeprefix(codecs.BOM_UTF8), file.name)
+    try:
+        value = json.loads(file.read_text("utf-8-sig"))  # with the mark of editors of Windows
+    except ValueError as error:
+        raise ValueError(f"{file.name}: {error}") from error
+    return checked(dict[str, Any], value, file.name)
 
 
 def _levels(rows: Sequence[LevelResults], seed: int, updates: int) -> dict[str, Column]:

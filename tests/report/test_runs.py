@@ -92,9 +92,9 @@ def replaced(old: str, new: str):
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("config.json", lambda text: text[:-5], "config.json: Invalid JSON: EOF"),
+        ("config.json", lambda text: text[:-5], "config.json: Unterminated string"),
         ("config.json", replaced('"schedule"', '"s"'), "'schedule' is missing"),
-        ("run.json", lambda text: "[]", "run.json: Input should be an object"),
+        ("run.json", lambda text: "[]", "run.json: Input should be a valid dictionary"),
         ("run.json", lambda text: "{}", "'task' is missing"),
         ("run.json", replaced('"title"', '"t"'), "run.json: task: title: Field required"),
         ("metrics.csv", replaced("0.5", "nan"), "id_success is not always a number"),
