@@ -49,7 +49,10 @@ class Log:
     @cached_property
     def entries(self) -> dict[str, Column]:
         """Numbers by name, NaN where there is none; of several in an entry the mean, float [m]."""
-        rows = [row | {f"share: {n}": s for n, s in batch_shares(row).items()} for row in self.rows]
+        rows = [
+            {**row, **{f"share: {name}": share for name, share in batch_shares(row).items()}}
+            for row in self.rows
+        ]
         names = dict.fromkeys([*COMMON, *(name for row in rows for name in row)])
         found = {
             name: np.array([_mean(row.get(name)) for row in rows])
