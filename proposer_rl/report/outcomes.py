@@ -28,7 +28,7 @@ from proposer_rl.report.statistics import (
 )
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, write
-from proposer_rl.runs.records import LONGEST_TEXT, level_text, printable, words
+from proposer_rl.runs.records import level_text, words
 
 MILLION = 1e6
 # What methods and ablations do, by ``method`` or ``ablation`` and name.
@@ -194,12 +194,11 @@ def answer(study: Study) -> tuple[str, str]:
 def meaning(group: Group, meanings: Meanings) -> str:
     """Returns what a method does, in a line: as its runs recorded it, or else as given."""
     run = group.runs[0]
-    about = run.facts.get("about")
-    own = about if isinstance(about, Mapping) else {}
-    said = []
-    for kind, name in (("method", run.method), ("ablation", run.ablation)):
-        text = own.get(kind) or meanings.get(kind, {}).get(name, "")
-        said.append(printable(str(text))[:LONGEST_TEXT])
+    about = run.facts.get("about", {})
+    said = [
+        about.get(kind) or meanings.get(kind, {}).get(name, "")
+        for kind, name in (("method", run.method), ("ablation", run.ablation))
+    ]
     text = said[0] or "Its runs do not say what it does."
     text += f" Changed here: {said[1]}" if said[1] else ""
     return f"{text} ({group.setting})" if group.setting else text

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import json
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -20,7 +19,6 @@ from proposer_rl.runs.records import (
     LARGEST,
     Column,
     LevelRecord,
-    LevelResults,
     Record,
     SampleRecord,
     TaskFacts,
@@ -106,7 +104,7 @@ def _read_folder(folder: Path) -> list[Run]:
         pd.DataFrame(read_csv(folder / "metrics.csv")),
         pd.DataFrame(_optional(folder / "training.csv", read_csv)),
         _optional(folder / "cycles.jsonl", read_jsonl),
-        checked(list[LevelResults], _optional(folder / "levels.jsonl", read_jsonl), "levels.jsonl"),
+        _optional(folder / "levels.jsonl", read_jsonl),
         checked(list[SampleRecord], recorded, "curriculum.jsonl"),
     )
 
@@ -159,21 +157,16 @@ def _by_run(folder: Path, name: str) -> dict[str, pd.DataFrame]:
     }
 
 
-def _level_results(levels: pd.DataFrame) -> list[LevelResults]:
+def _level_results(levels: pd.DataFrame) -> list[Record]:
+    """Returns a study's rows of single levels as a folder has them: a record for each seed."""
     if not len(levels):
         return []
     place = ["seed", "updates", "distribution"]
-    values = levels.drop(columns=[*place, "level"]).astype(float)
-    numbers = {name: values[name].to_numpy() for name in values}
-    rows: dict[tuple[str, ...], list[int]] = {}
-    for row, key in enumerate(zip(*(levels[name].tolist() for name in place), strict=True)):
-        rows.setdefault(key, []).append(row)
     found = []
-    for (seed, updates, name), own in rows.items():
-        known = {kind: column[own] for kind, column in numbers.items()}
+    for (seed, updates, name), own in levels.groupby(place, sort=False):
         about = {"seed": int(seed), "updates": int(updates), "distribution": name}
-        about |= {kind: some.tolist() for kind, some in known.items() if not np.isnan(some).any()}
-        found.append(checked(LevelResults, about, "levels.csv.xz"))
+        known = own.drop(columns=[*place, "level"]).astype(float).dropna(axis=1)
+        found.append(about | known.to_dict("list"))
     return found
 
 
@@ -184,7 +177,7 @@ def _runs(
     metrics: pd.DataFrame,
     training: pd.DataFrame,
     cycles: Sequence[Any],
-    levels: Sequence[LevelResults],
+    levels: Sequence[Record],
     samples: Sequence[SampleRecord],
 ) -> list[Run]:
     """Returns a run for each seed; ``facts`` have ``updates`` only of finished runs."""
@@ -221,19 +214,22 @@ def _optional(file: Path, read: Callable[[Path], list[Any]]) -> list[Any]:
 
 
 def _read_json(file: Path) -> dict[str, Any]:
-    # Editors of Windows put a mark in front.
-    return checked(dict[str, Any], file.read_bytes().removeprefix(codecs.BOM_UTF8), file.name)
+    try:
+        value = json.loads(file.read_text("utf-8-sig"))  # with the mark of editors of Windows
+    except ValueError as error:
+        raise ValueError(f"{file.name}: {error}") from error
+    return checked(dict[str, Any], value, file.name)
 
 
-def _levels(rows: Sequence[LevelResults], seed: int, updates: int) -> dict[str, Column]:
+def _levels(rows: Sequence[Record], seed: int, updates: int) -> dict[str, Column]:
     """Returns what a seed reached on every level after that many updates, [levels] by column."""
     found = {}
     for row in rows:
-        if (row.seed, row.updates) == (seed, updates):
-            for kind, values in (("success", row.success), ("return", row.returns)):
-                if values is not None:
-                    name = f"{row.distribution}_{kind}"
-                    found[name] = _rounded(is_rate(name), np.array(values, float))
+        if (row["seed"], row["updates"]) == (seed, updates):
+            for kind in ("success", "return"):
+                if row.get(kind) is not None:
+                    name = f"{row['distribution']}_{kind}"
+                    found[name] = _rounded(is_rate(name), np.array(row[kind], float))
     return found
 
 

@@ -116,8 +116,8 @@ class Run:
     @property
     def planned(self) -> int | None:
         """Updates that the run shall have; None where the folder does not say."""
-        value = self.facts.get("planned_updates", self.facts.get("updates"))
-        return value if isinstance(value, int) else None
+        value: int | None = self.facts.get("planned_updates", self.facts.get("updates"))
+        return value
 
     @cached_property
     def columns(self) -> Mapping[str, Column]:
@@ -205,7 +205,7 @@ class Run:
         sides = tuple(len(values) for values in self.task.space.values())
         try:
             counts = np.asarray(cycle.get("histogram"), float)
-        except (ValueError, TypeError, OverflowError):
+        except (ValueError, TypeError):
             return None
         if not sides or counts.shape != sides or not (counts >= 0).all():
             return None

@@ -10,12 +10,12 @@ import re
 from collections.abc import Hashable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
-from pydantic import BaseModel, Field, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import BaseModel, FiniteFloat, TypeAdapter, ValidationError
 
 from proposer_rl.runs.folder import is_rate, read_bounded
 
@@ -40,16 +40,6 @@ class LevelRecord(BaseModel):
 
     picture: str | None = None
     text: list[str] = []
-
-
-class LevelResults(BaseModel):
-    """A seed's results on every level of a distribution."""
-
-    updates: int
-    seed: int
-    distribution: str
-    success: list[FiniteFloat] | None = None
-    returns: Annotated[list[FiniteFloat] | None, Field(alias="return")] = None
 
 
 class SampleRecord(BaseModel):

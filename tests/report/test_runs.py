@@ -92,9 +92,9 @@ def replaced(old: str, new: str):
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("config.json", lambda text: text[:-5], "config.json: Invalid JSON: EOF"),
+        ("config.json", lambda text: text[:-5], "config.json: Unterminated string"),
         ("config.json", replaced('"schedule"', '"s"'), "'schedule' is missing"),
-        ("run.json", lambda text: "[]", "run.json: Input should be an object"),
+        ("run.json", lambda text: "[]", "run.json: Input should be a valid dictionary"),
         ("run.json", lambda text: "{}", "'task' is missing"),
         ("run.json", replaced('"title"', '"t"'), "run.json: task: title: Field required"),
         ("metrics.csv", replaced("0.5", "nan"), "id_success is not always a number"),
@@ -104,7 +104,6 @@ def replaced(old: str, new: str):
         ("metrics.csv", lambda text: text + text.splitlines()[1] + "\n", "do not grow"),
         ("curriculum.jsonl", replaced('"seed": 0', '"seed": "0"'), "0.seed: Input should be a"),
         ("cycles.jsonl", replaced('"cycle": 0', '"levels": ["x"]'), "cycles.jsonl: levels: Input"),
-        ("levels.jsonl", replaced("0.5", "NaN"), "0.success.0: Input should be a finite number"),
     ],
 )
 def test_a_folder_that_cannot_be_read_is_named_in_one_line(
