@@ -413,6 +413,19 @@ class Teacher:
                 steps = TensorDict.from_dict(dict(kept["kept"]), batch_size=kept["shape"])
                 self._kept = steps.flatten()
 
+    def diverge(self, number: int) -> None:
+        """Makes this teacher propose other levels, from the next one on, than its copies do.
+
+        Each of several processes that made or loaded the same teacher calls it with a number of
+        its own, such as its rank. With 0 nothing changes.
+        """
+        with self._here():
+            if number:
+                self._seeds = [seed + number for seed in self._seeds]
+                if self._block is not None:
+                    self._block.state[:, self._at - self._block.start :] = OVER
+                self._use(None, 0)
+
     @cached_property
     def _like(self) -> Levels:
         """One level of the space."""

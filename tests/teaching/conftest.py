@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ def install(tmp_path_factory: pytest.TempPathFactory) -> Install:
     pip cannot install them, as without a network.
     """
 
+    @cache
     def installed(requirements: str, python: str | None = None) -> Path:
         # dill, of which datasets makes use, takes modules for parts of a script elsewhere.
         folder = tmp_path_factory.mktemp("registry") / "site-packages"
@@ -33,7 +35,7 @@ def install(tmp_path_factory: pytest.TempPathFactory) -> Install:
         )
         if done.returncode:
             reason = (done.stderr.strip() or "no pip").splitlines()[-1]
-            pytest.skip(f"cannot install {requirements}: {reason}")
+            pytest.skip(f"cannot install {requirements.split()[0]}: {reason}")
         return folder
 
     return installed
