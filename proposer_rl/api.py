@@ -61,6 +61,8 @@ from proposer_rl.teaching import (
 if TYPE_CHECKING:
     import pandas as pd
 
+    from proposer_rl.tasks.policy import Policy
+
 __all__ = [
     "DEFAULT_METHOD",
     "PPO",
@@ -158,6 +160,19 @@ class Run:
     def solver(self) -> ActorCritic:
         """Returns the trained Solvers of the newest checkpoint; see :meth:`ActorCritic.actor`."""
         return self._stored()[1]
+
+    def policy(self, seed: int | None = None) -> Policy:
+        """Returns one trained Solver for Gymnasium, TorchRL and ``torch.export``.
+
+        Args:
+            seed: whose, of a run of several seeds; None for the first.
+        """
+        from proposer_rl.cli.stored import stored_run
+        from proposer_rl.tasks.policy import policy_of
+
+        run = stored_run(self.folder)
+        chosen = run.config.seeds[0] if seed is None else seed
+        return policy_of(run.task, run.stage(seeds=[chosen]).learner)
 
     def task(self) -> Task:
         """Returns the task that they were trained on."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
@@ -31,6 +31,7 @@ from proposer_rl.tasks.gymnasium.batched_env import FLAGS, GymnasiumEnv, Vectori
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork, solver_network
 from proposer_rl.tasks.gymnasium.pictures import FRAMES, NO_FRAMES, Camera
 from proposer_rl.tasks.gymnasium.player import (
+    LevelPlayer,
     MakeEnvironment,
     ParameterSettings,
     WrapperSettings,
@@ -236,6 +237,22 @@ class GymnasiumTask(Task):
             self._camera.picture(play, actions[steps])
             for play, actions, steps in zip(plays(levels), rollout["action"], first, strict=True)
         ]
+
+    def own_spaces(self) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any]]:
+        """Returns the environment's own spaces, of observations behind its wrappers and of actions.
+
+        Raises:
+            ValueError: if transforms change what the Solver sees or does.
+        """
+        if self._unpaid():
+            raise ValueError(
+                "transforms: these are not applied to observations of a plain environment; put "
+                "run.solver().actor() into a TransformedEnv with them"
+            )
+        make = replace(self._make, as_it_is=True)
+        env = LevelPlayer(make, self._parameters, plays(self.evaluated_on["target"][:1])[0])
+        env.close()
+        return env.observation_space, env.action_space
 
     @cached_property
     def _camera(self) -> Camera:
