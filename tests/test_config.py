@@ -509,36 +509,6 @@ def test_a_state_that_lacks_a_part_is_refused(finished: Path, train, capsys) -> 
     assert "does not fit this run: 'curriculum'" in refused(train, capsys)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"updates": "x"},
-        {"updates": -1},
-        {"updates": 2.5},
-        {"cycles": 99},
-        {"cycles": True},
-        {"seconds": None},
-        {"seconds": float("nan")},
-        {"evaluations": [1]},
-        {"curriculum_frames": "many"},
-        {"headline": 3},
-        {"headline": ["x"]},
-        {"rows": {"metrics.csv": "x"}},
-        {"rows": []},
-        {"solver": 3},
-        {"curriculum": 3},
-    ],
-    ids=str,
-)
-def test_a_state_of_wrong_types_is_refused(wrong: dict, finished: Path, made: Made) -> None:
-    folder = RunFolder(copy_of(finished))
-    number, state = load_latest(finished / "checkpoints")
-    save_checkpoint(folder.path / "checkpoints", number, {**state, **wrong})
-    with pytest.raises(Exception, match="does not fit this run: ") as error:
-        build(composed("+method=target", *SMOKE), made, folder, StopSignals()).run()
-    assert exit_code(error.value) == BAD_INPUT
-
-
 def test_a_table_that_was_shortened_is_refused(finished: Path, train, capsys) -> None:
     folder = copy_of(finished)
     (folder / "metrics.csv").write_text("seed\n")
