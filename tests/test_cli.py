@@ -146,6 +146,10 @@ def test_a_run_whose_files_were_rewritten_on_windows_goes_on(run: Path, train, m
     assert [row["updates"] for row in read_csv(run / "metrics.csv")] == [0, 2, 4]
     assert tables(run)["metrics.csv"][:2] == before["metrics.csv"]
     assert len(proposer_rl.Run(run).metrics) == 3
+    summary = run / "summary.json"
+    summary.write_bytes(mark + summary.read_bytes())
+    assert proposer_rl.Run(run).summary["updates"] == 4
+    assert proposer_rl.Run(run).solver().copies == 1
 
 
 def test_a_table_that_cannot_be_read_is_named_before_training_goes_on(
