@@ -256,7 +256,8 @@ def _of_seed(table: pd.DataFrame, seed: int) -> pd.DataFrame:
 
 def _check_metrics(run: Run) -> None:
     """Refuses what would make every comparison wrong in silence."""
-    unknown = run.metrics[[*COST, *run.measurements, run.headline]].isna().any()
+    needed = {*COST, *run.measurements, run.headline}
+    unknown = run.metrics.reindex(columns=sorted(needed)).isna().any()
     if unknown.any():
         raise ValueError(f"metrics.csv: {unknown.idxmax()} is not always a number")
     if (np.diff(run.metrics["updates"]) <= 0).any():

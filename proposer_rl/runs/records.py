@@ -98,7 +98,7 @@ def small_json(path: Path, largest: int = 2**20) -> Any:
     """Returns the content of a run's small JSON file; None if it cannot be read."""
     try:
         return json.loads(read_bounded(path, largest))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
 
 

@@ -99,6 +99,7 @@ def replaced(old: str, new: str):
         ("run.json", replaced('"title"', '"t"'), "run.json: task: title: Field required"),
         ("metrics.csv", replaced("0.5", "nan"), "id_success is not always a number"),
         ("metrics.csv", replaced("0.5", "1e300"), "id_success is not always a number"),
+        ("metrics.csv", replaced("id_success", "x"), "id_success is not always a number"),
         ("metrics.csv", replaced("0.5", "half"), "metrics.csv, line 3: 'half' is not a number"),
         ("metrics.csv", lambda text: text.splitlines()[0] + "\n", "no rows yet"),
         ("metrics.csv", lambda text: text + text.splitlines()[1] + "\n", "do not grow"),
