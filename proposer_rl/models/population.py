@@ -45,8 +45,7 @@ class Population(nn.Module):
             a GPU but not on a CPU, where only very small networks are faster that way.
 
     Raises:
-        ValueError: for fewer than one replica or core, another precision, or a network with
-            buffers.
+        ValueError: for a network with buffers.
 
     Example:
         >>> population = Population(lambda: nn.Linear(3, 2), copies=5)
@@ -64,10 +63,6 @@ class Population(nn.Module):
     ) -> None:
         super().__init__()
         cores = available_cores() if cores is None else cores
-        if min(copies, cores) < 1:
-            raise ValueError(f"copies and cores must be at least 1, got {copies} and {cores}")
-        if precision not in ("fp32", "bf16"):
-            raise ValueError(f"precision must be 'fp32' or 'bf16', got {precision!r}")
         members = [make() for _ in range(copies)]
         if next(members[0].buffers(), None) is not None:
             raise ValueError("a Population's network must not have buffers")

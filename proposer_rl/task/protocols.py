@@ -251,13 +251,8 @@ def space_features(space: Any, levels: Levels) -> Tensor:
         float64 [*B, 1 + 2 D + N] on the CPU.
 
     Raises:
-        ArgumentError: if the space cannot locate levels, or has no axes.
+        ArgumentError: if the space has no axes.
     """
-    if not hasattr(space, "locate"):
-        raise ArgumentError(
-            f"space={type(space).__name__}: must define locate(levels), the coordinates of levels, "
-            "from which a model of outcomes tells them apart"
-        )
     c = space.locate(levels).double().cpu()
     if not c.shape[-1]:
         raise ArgumentError(

@@ -45,9 +45,6 @@ class LevelEnv(EnvBase):
     Attributes:
         success_rule: What of a step is a success, as ``success`` of
             :class:`~proposer_rl.teaching.LevelTransform`.
-
-    Raises:
-        ValueError: If ``max_steps`` is less than 1.
     """
 
     success_rule = "terminated"
@@ -55,8 +52,6 @@ class LevelEnv(EnvBase):
 
     def __init__(self, levels: Level, max_steps: int) -> None:
         check_torch_defaults()
-        if max_steps < 1:
-            raise ValueError(f"max_steps must be at least 1, got {max_steps}")
         super().__init__(
             device=levels.walls.device,
             batch_size=levels.batch_size,
@@ -232,9 +227,6 @@ class MazeEnv(LevelEnv):
         step_penalty: Cost of a step.
         observe_agent: Whether the planes show the agent.
 
-    Raises:
-        ValueError: If ``max_steps`` is less than 1.
-
     Example:
         >>> from proposer_rl import Level
         >>> env = MazeEnv(Level.from_text("S.G"))
@@ -270,12 +262,7 @@ class MazeEnv(LevelEnv):
         Returns:
             uint8 ``[*B, H', W', 3]``; or text (a list of texts for a batch) in which ``A`` is the
             agent.
-
-        Raises:
-            ValueError: If the mode is another.
         """
-        if mode not in ("rgb_array", "ansi"):
-            raise ValueError(f"mode must be 'rgb_array' or 'ansi', got {mode!r}")
         levels, agents = self._levels.reshape(-1), self._agent.reshape(-1, 2)
         if mode == "ansi":
             places = cell_index(agents, self._grid[1] + 1).tolist()  # a line ends by a character

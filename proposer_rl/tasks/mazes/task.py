@@ -33,8 +33,7 @@ from proposer_rl.tasks.mazes.maze_settings import (
     MazeSettings,
     SpaceSettings,
     UNetSettings,
-    check_level_size,
-    check_network,
+    check_grid,
     faster_precision,
     unet,
 )
@@ -82,7 +81,7 @@ class MazeTask(GridTask):
         make_network: Callable[[], nn.Module] | None = None,
     ) -> None:
         if make_network is None:
-            check_network(maze, network)
+            check_grid("maze", (maze.height, maze.width), network)
             if context.precision == "auto":
                 precision = faster_precision(network.channels, torch.device(context.device))
                 context = context._replace(precision=precision)
@@ -212,7 +211,7 @@ class MazeTask(GridTask):
     def check_level(self, name: str, level: Level) -> None:
         """Refuses a level that the U-Net cannot see; of other networks it is not known."""
         if self._make_network is None:
-            check_level_size(name, level.walls.shape, self._network)
+            check_grid(f"level {name!r}", level.walls.shape, self._network)
 
     def at_once(self, cells: int) -> int:
         """Returns how many levels of so many cells are evaluated together."""
