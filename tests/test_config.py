@@ -168,13 +168,10 @@ WRONG = [
         "compute.ray_address=auto",
         "compute.ray_address=auto: is of use only with compute.collector=ray",
     ),
-    ("task.maze.height=3", "task.network.channels=[64, 128, 256] halve a 3x10 maze to nothing"),
-    ("task.network.channels=[64,64,64,8]", "with a single number on a 10x10 maze"),
+    ("task.maze.height=3", "task.maze: 3x10 cells are too few for this Solver"),
+    ("task.network.channels=[64,64,64,8]", "task.maze: 10x10 cells are too few"),
     ("task.maze.max_steps=5", "task.maze.max_steps=5 must be at least 12, the path length of"),
-    (
-        "task.network.channels=[12]",
-        "task.network.channels=[12] must be multiples of network.groups=8",
-    ),
+    ("task.network.channels=[12]", "must be divisible by num_groups (8)"),
     ("task.space.path_lengths=[50]", "task.space: cannot make levels with obstacle_fraction=0"),
     ("task.space.path_lengths=[2,2]", "space: path_lengths must be distinct, got [2, 2]"),
     (

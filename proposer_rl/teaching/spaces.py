@@ -268,7 +268,7 @@ class Parameters(LevelSpace, ParameterSpace):
                 warnings.warn(
                     f"{where}: most of it, {part}, lies outside of {low:g} to {high:g}, and comes "
                     "from the nearer end",
-                    stacklevel=5,
+                    stacklevel=4,
                 )
         return parts
 
@@ -563,7 +563,7 @@ def _warn_of_two(key: str, values: Any) -> None:
         warnings.warn(
             f"{key}={values}: a list is single values, here two and nothing between them; the "
             f"range from {low} to {high} is a tuple, ({low}, {high})",
-            stacklevel=4,
+            stacklevel=3,
         )
 
 
@@ -574,7 +574,7 @@ def _warn_of_places(key: str, labels: Sequence[Any]) -> None:
             warnings.warn(
                 f"{key}={shown(labels)}: in batches a level has its place in this list, {place} "
                 f"for {label}, and the value itself one by one alone",
-                stacklevel=4,
+                stacklevel=3,
             )
             return
 
