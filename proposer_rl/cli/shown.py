@@ -6,13 +6,10 @@ Training is given this module and knows nothing of what draws; figures take a wh
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra.experimental.callback import Callback
-from omegaconf import DictConfig
 from rich.console import Console
 
 from proposer_rl.cli.errors import say
@@ -21,27 +18,15 @@ from proposer_rl.runs.folder import FAILURE, is_rate
 from proposer_rl.runs.records import level_text
 
 
-class SweepSummary(Callback):
-    """Lists the runs of a sweep when it is over.
+def show_sweep(folder: Path, failed_before: Mapping[Path, int]) -> int:
+    """Lists the runs of a sweep that is over.
 
-    The exit code is that of a run that failed in it; other sweeps may have the same folder.
+    Returns:
+        The highest exit code of the runs that failed in it; other sweeps may have the same folder.
     """
-
-    def __init__(self) -> None:
-        self._failed_before: dict[Path, int] = {}
-
-    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Notes earlier failures in the sweep's folder, before the first run."""
-        self._failed_before = _failures(config)
-
-    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        """Prints the sweep's runs, and exits with a failed one's code."""
-        found = find_progress(Path(config.hydra.sweep.dir))
-        Console().print(overview(found))
-        failed = _failures(config).items() - self._failed_before.items()
-        if failed:
-            # Hydra turns an exception of a callback into a warning, but lets an exit through.
-            sys.exit(max(int(json.loads(file.read_text())["exit_code"]) for file, _ in failed))
+    Console().print(overview(find_progress(folder)))
+    failed = failures(folder).items() - failed_before.items()
+    return max((int(json.loads(file.read_text())["exit_code"]) for file, _ in failed), default=0)
 
 
 def draw_run(folder: Path, title: str) -> Path:
@@ -85,7 +70,6 @@ def _cost_text(result: Mapping[str, Any], seeds: int) -> str:
     )
 
 
-def _failures(config: DictConfig) -> dict[Path, int]:
+def failures(folder: Path) -> dict[Path, int]:
     """Returns the files that record failed runs in a sweep's folder, with their times."""
-    folder = Path(config.hydra.sweep.dir)
     return {file: file.stat().st_mtime_ns for file in folder.rglob(FAILURE)}
