@@ -210,8 +210,7 @@ def located(name: str, values: Mapping[str, Any]) -> tuple[Callable[..., Any], d
         cause: BaseException = error
         while cause.__cause__ is not None:
             cause = cause.__cause__
-        said = f"{one_line(error)}: {one_line(cause)}" if cause is not error else one_line(error)
-        raise ConfigError(f"{name}._target_={target}: {said}{where_to_look(cause)}") from error
+        raise ConfigError(f"{name}: {one_line(cause)}{where_to_look(cause)}") from error
     return made.func, made.keywords
 
 

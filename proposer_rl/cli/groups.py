@@ -112,7 +112,8 @@ def _filters(overrides: Sequence[str]) -> bool:
 def _word(parsed: Override) -> str:
     """Returns an override as Hydra takes it, see :func:`arranged`."""
     word, group = str(parsed.input_line), parsed.key_or_group
-    values = parsed.value().list if parsed.is_choice_sweep() else [parsed.value()]
+    value: Any = parsed.value()
+    values = value.list if parsed.is_choice_sweep() else [value]
     if parsed.is_delete() or not (CONFIG_FOLDER / group).is_dir():
         return word
     if None in values and group in NOTHING:
@@ -208,4 +209,4 @@ def explained(error: Exception) -> str:
         if isinstance(holder, DictConfig):
             known = sorted(str(key) for key in holder if holder._get_full_key(key) != "hydra")
             return f"{cause.full_key}: unknown; there are: {', '.join(known) or 'none'}"
-    return one_line(error)
+    return ": ".join(map(one_line, filter(None, (error, cause))))
