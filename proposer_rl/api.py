@@ -154,7 +154,7 @@ class Run:
     @property
     def summary(self) -> dict[str, Any]:
         """The run's last measurements, its costs, and when it reached the threshold."""
-        content: dict[str, Any] = json.loads((self.folder / "summary.json").read_text())
+        content: dict[str, Any] = json.loads((self.folder / "summary.json").read_bytes())
         return content
 
     @property

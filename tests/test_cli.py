@@ -146,6 +146,10 @@ def test_a_run_whose_files_were_rewritten_on_windows_goes_on(run: Path, train, m
     assert [row["updates"] for row in read_csv(run / "metrics.csv")] == [0, 2, 4]
     assert tables(run)["metrics.csv"][:2] == before["metrics.csv"]
     assert len(proposer_rl.Run(run).metrics) == 3
+    summary = run / "summary.json"
+    summary.write_bytes(mark + summary.read_bytes())
+    assert proposer_rl.Run(run).summary["updates"] == 4
+    assert proposer_rl.Run(run).solver().copies == 1
 
 
 def test_a_table_that_cannot_be_read_is_named_before_training_goes_on(
@@ -228,12 +232,15 @@ def test_what_hydra_cannot_read_is_named(override: str, train, capsys) -> None:
     assert len(error.splitlines()) == 1 and "https" not in error
 
 
-def test_an_error_of_ours_within_a_run_is_no_bad_input(train, monkeypatch) -> None:
+@pytest.mark.parametrize("error", [ValueError("a bug"), BrokenPipeError(32, "a lost process")])
+def test_an_unforeseen_error_within_a_run_is_no_bad_input_and_none_of_the_disk(
+    error: Exception, train, monkeypatch
+) -> None:
     def broken(*_: object) -> float:
-        raise ValueError("a bug")
+        raise error
 
     monkeypatch.setattr("proposer_rl.cli.run.train", broken)
-    with pytest.raises(ValueError, match="a bug"):
+    with pytest.raises(type(error), match=r"a bug|a lost process"):
         train("+method=target", *SMOKE, "hydra.run.dir=run")
 
 

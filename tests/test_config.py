@@ -38,7 +38,7 @@ from proposer_rl.cli.run import check_same_run
 from proposer_rl.extras import install_command
 from proposer_rl.learning import DivergedError
 from proposer_rl.recipes import CONFIG_FOLDER, available
-from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
+from proposer_rl.runs.checkpoint import load_latest
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.process import Interrupted, StopSignals
 from tests.same_run import assert_same_run
@@ -431,49 +431,6 @@ def test_a_checkpoint_of_another_architecture_is_refused(finished: Path, train, 
     (folder / "config.json").write_text(json.dumps(config))
     line = refused(train, capsys, "task.network.channels=[8,8]")
     assert "checkpoint 1 in " in line and "does not fit this run: the snapshot belongs to" in line
-
-
-@pytest.mark.parametrize("step", [-1, 1])
-def test_a_checkpoint_of_another_format_is_refused(
-    step: int, finished: Path, train, capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from proposer_rl.runs import checkpoint
-
-    folder = copy_of(finished)
-    number, state = load_latest(finished / "checkpoints")
-    with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "FORMAT", checkpoint.FORMAT + step)
-        save_checkpoint(folder / "checkpoints", number + 1, state)
-    line = refused(train, capsys)
-    assert f"has format {checkpoint.FORMAT + step}" in line and "reads only format" in line
-
-
-def test_a_state_that_lacks_a_part_is_refused(finished: Path, train, capsys) -> None:
-    folder = copy_of(finished)
-    number, state = load_latest(finished / "checkpoints")
-    del state["curriculum"]
-    save_checkpoint(folder / "checkpoints", number + 1, state)
-    assert "does not fit this run: 'curriculum'" in refused(train, capsys)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"headline": 3},
-        {"headline": ["x"]},
-        {"rows": {"metrics.csv": "x"}},
-        {"solver": 3},
-        {"curriculum": 3},
-    ],
-    ids=str,
-)
-def test_a_state_of_wrong_types_is_refused(wrong: dict, finished: Path, made: Made) -> None:
-    folder = RunFolder(copy_of(finished))
-    number, state = load_latest(finished / "checkpoints")
-    save_checkpoint(folder.path / "checkpoints", number, {**state, **wrong})
-    with pytest.raises(Exception, match="does not fit this run: ") as error:
-        build(composed("+method=target", *SMOKE), made, folder, StopSignals()).run()
-    assert exit_code(error.value) == BAD_INPUT
 
 
 def test_a_table_that_was_shortened_is_refused(finished: Path, train, capsys) -> None:

@@ -142,8 +142,6 @@ def test_one_checkpoint_of_a_run(run: Path, tmp_path: Path, evaluate) -> None:
         (["{run}", "-o", "rows.txt"], "--output rows.txt: must end in .json or .csv"),
         (["{run}", "-o", "no/rows.csv"], "--output no/rows.csv: there is no folder no"),
         (["{run}", "--max-steps", "0"], "must be a whole number from 1 to 100,000, got '0'"),
-        (["{run}", "--max-steps", "100001"], "from 1 to 100,000, got '100001'"),
-        (["{run}", "--max-steps", "many"], "must be a whole number from 1 to"),
     ],
 )
 def test_bad_input_is_told_in_one_line(

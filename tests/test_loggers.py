@@ -88,23 +88,14 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 class Stand(ModuleType):
     """In the place of the package wandb, which the tests' environment does not have."""
 
-    Error = type("Error", (Exception,), {})
-
     def __init__(self) -> None:
         super().__init__("wandb")
         self.runs: list[dict[str, Any]] = []
-        self.rows: list[tuple[int, dict[str, Any]]] = []
         self.ended: list[int] = []
-
-    def login(self) -> None:
-        raise self.Error("No API key configured.\nUse `wandb login` to log in.")
 
     def init(self, **options: Any) -> Stand:
         self.runs.append(options)
         return self
-
-    def log(self, row: dict[str, Any], step: int) -> None:
-        self.rows.append((step, row))
 
     def finish(self, exit_code: int = 0) -> None:
         self.ended.append(exit_code)
@@ -116,20 +107,6 @@ def stand(monkeypatch: pytest.MonkeyPatch) -> Stand:
     monkeypatch.setitem(sys.modules, "wandb", module)
     monkeypatch.setattr("proposer_rl.cli.loggers.find_spec", lambda name: name)
     return module
-
-
-@pytest.mark.usefixtures("own_folder")
-@pytest.mark.parametrize("variable", [None, "online"])
-def test_without_an_account_one_line_and_nothing_written(
-    variable: str | None, stand: Stand, train, capsys, monkeypatch
-) -> None:
-    monkeypatch.delenv("WANDB_MODE", raising=False)
-    if variable:
-        monkeypatch.setenv("WANDB_MODE", variable)
-    assert train(*SMOKE, "logger=wandb") == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith("error: logger=wandb: No API key configured. Use `wandb login`")
-    assert not Path("run").exists() and not stand.runs
 
 
 def test_what_is_given_goes_before_the_variables_of_weights_and_biases(

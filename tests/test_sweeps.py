@@ -7,12 +7,12 @@ import json
 import signal
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
-from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn, JobStatus
+from hydra.experimental.callback import Callback
 from omegaconf import OmegaConf
 from submitit.core.utils import UncompletedJobError
 
@@ -214,18 +214,22 @@ def test_settings_whose_names_no_folder_can_have_stay_apart() -> None:
     assert all("/" not in name and len(name) < 150 for name in names)
 
 
-def test_sweepers_see_which_runs_failed(train, monkeypatch: pytest.MonkeyPatch) -> None:
+class Noted(Callback):
+    """What Hydra's launchers give to sweepers."""
+
+    seen: ClassVar[list[JobReturn]] = []
+
+    def on_job_end(self, config: Any, job_return: JobReturn, **_: Any) -> None:
+        """Notes how a run ended."""
+        self.seen.append(job_return)
+
+
+def test_sweepers_see_which_runs_failed(train) -> None:
     """Optuna's counts failures up to max_failure_rate; a value of NaN would end its study."""
-    seen: list[JobReturn] = []
-    launch = BasicLauncher.launch
-
-    def noted(*arguments: Any, **named: Any) -> Any:
-        seen.extend(found := launch(*arguments, **named))
-        return found
-
-    monkeypatch.setattr(BasicLauncher, "launch", noted)
-    assert train("-m", "+method=target", "solver.batch_size=0,4", *FEW) == 2
-    failed, made = seen
+    Noted.seen.clear()
+    watched = f"+hydra.callbacks.noted._target_={__name__}.Noted"
+    assert train("-m", "+method=target", "solver.batch_size=0,4", *FEW, watched) == 2
+    failed, made = Noted.seen
     assert (failed.status, made.status) == (JobStatus.FAILED, JobStatus.COMPLETED)
     with pytest.raises(FailedRunError, match=r"^solver\.batch_size=0: ") as raised:
         _ = failed.return_value

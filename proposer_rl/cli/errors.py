@@ -40,8 +40,6 @@ def command(body: Callable[[], None]) -> None:
     except KeyboardInterrupt:
         sys.exit(SIGNALLED + SIGINT)
     except Exception as error:
-        if exit_code(error) == UNFORESEEN:
-            raise
         refuse(error)
 
 
@@ -53,9 +51,16 @@ def say(text: str) -> None:
 
 
 def refuse(error: Exception, folder: Path | None = None) -> NoReturn:
-    """Prints an error in one line, as :func:`one_line` does, and exits with its code."""
+    """Prints an error in one line, as :func:`one_line` does, and exits with its code.
+
+    Raises:
+        Exception: the error itself, if it was not foreseen.
+    """
+    code = exit_code(error)
+    if code == UNFORESEEN:
+        raise error
     print(f"error: {one_line(error, folder)}", file=sys.stderr)
-    sys.exit(exit_code(error))
+    sys.exit(code)
 
 
 def exit_code(error: BaseException) -> int:

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from proposer_rl.cli.errors import ConfigError, command, number
+from proposer_rl.cli.errors import ConfigError, command, number, settings_file
 from proposer_rl.extras import install_command
 
 if TYPE_CHECKING:
@@ -59,6 +59,7 @@ def _run(options: argparse.Namespace) -> None:
 
 def open_session(folder: Path) -> Session:
     """Returns the session that shows the run in a folder."""
+    settings_file(folder)  # before what takes seconds to import
     from proposer_rl.cli.run import run_name
     from proposer_rl.cli.stored import stored_run
     from proposer_rl.play.session import Session

@@ -56,13 +56,14 @@ class RunFolder:
                 first row makes the header); for ``.jsonl`` whatever JSON can hold.
 
         Raises:
-            ValueError: if a value cannot be written, or the keys are not those of the header.
+            ValueError: if a value is no number, or the keys are not those of the header.
+            TypeError: if JSON cannot hold it.
             StorageError: if the disk does not take the row.
         """
         path = self.path / name
         with storage(path):
             first = _first_line(path)
-            lines = _json(path, dict(row)) if path.suffix == ".jsonl" else _csv(path, row, first)
+            lines = json.dumps(dict(row)) if path.suffix == ".jsonl" else _csv(path, row, first)
             _write(path, "ab", (lines + "\n").encode())
             if first is None:
                 _sync_folder(self.path)
@@ -100,8 +101,7 @@ class RunFolder:
 
     def write_json(self, name: str, value: object) -> None:
         """Writes a JSON file; a reader sees the old content or the new, never a part."""
-        path = self.path / name
-        write_atomically(path, (_json(path, value, indent=2) + "\n").encode())
+        write_atomically(self.path / name, (json.dumps(value, indent=2) + "\n").encode())
 
     def _tables(self) -> list[Path]:
         return [path for path in map(self.path.joinpath, TABLES) if path.is_file()]
@@ -224,13 +224,6 @@ def _number(place: str, text: str) -> Number:
         with suppress(ValueError):
             return kind(text)
     raise ValueError(f"{place}: {text!r} is not a number")
-
-
-def _json(path: Path, value: object, indent: int | None = None) -> str:
-    try:
-        return json.dumps(value, indent=indent)
-    except TypeError as error:
-        raise ValueError(f"{path}: {error}") from None
 
 
 def _lines(path: Path) -> Iterator[tuple[str, str]]:

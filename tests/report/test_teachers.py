@@ -82,7 +82,7 @@ def test_what_is_of_runs_is_refused_beside_a_log(
     [
         ("", "is no log of a teacher"),
         (json.dumps({"told": 1}) + "\n", "is no log of a teacher"),
-        ("{\n", "not JSON"),
+        ("{\n", "not a JSON object"),
         (json.dumps({"told": 1, "drawn": {"g": {"1": "many"}}}) + "\n", "could not convert"),
     ],
 )

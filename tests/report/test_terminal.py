@@ -75,16 +75,6 @@ def test_a_run_says_what_it_is_doing_and_how_long_the_rest_takes(tmp_path: Path,
     assert f"run: {text}, about" in watch(capsys, str(tmp_path))
 
 
-@pytest.mark.parametrize(
-    "content",
-    ["{", "[]", '{"doing": 1}', "[" * 3000, "x" * 5000, '{"doing": NaN}'],
-)
-def test_what_a_run_says_may_be_anything(content: str, tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run", finished=False)
-    (folder / "progress.json").write_text(content)
-    assert read_progress(folder).activity == ""
-
-
 def test_an_unreadable_run_is_said_to_have_failed(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run")
     (folder / "metrics.csv").write_text("a,b\n1,x\n")

@@ -246,7 +246,7 @@ def test_a_file_system_that_cannot_sync_folders_is_warned_of_once(
 def test_write_json_replaces_by_what_json_can_hold(folder: RunFolder) -> None:
     folder.write_json("summary.json", {"a": [1, 0.1]})
     folder.write_json("summary.json", {"b": None})
-    with pytest.raises(ValueError, match=r"summary\.json: .*not JSON serializable"):
+    with pytest.raises(TypeError, match="not JSON serializable"):
         folder.write_json("summary.json", {"a": object()})
     assert json.loads((folder.path / "summary.json").read_text()) == {"b": None}
     assert [path.name for path in folder.path.iterdir()] == ["summary.json"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import pytest
@@ -280,11 +279,3 @@ def test_ways_that_would_take_minutes_are_refused(monkeypatch: pytest.MonkeyPatc
     assert list(levels_from_text(first)) == ["a"]
     with pytest.raises(ValueError, match="level 'b': up to here, cells times moves of the"):
         levels_from_text(both)
-
-
-def test_what_never_ends_is_no_file(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe.txt")
-    (tmp_path / "zero.txt").symlink_to("/dev/zero")
-    for path in tmp_path.iterdir():
-        with pytest.raises(ValueError, match="is no plain file"):
-            read_levels(path)
