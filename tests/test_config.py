@@ -257,7 +257,10 @@ ALONE = ["+method=target"]
 GROUPS_AS_GIVEN = [
     ([*ALONE, "logger=null"], [*ALONE, "logger=csv"]),
     ([*ALONE, "filter=null"], ALONE),
-    (["+method=plr,arc_length", "filter=null"], ["+method=plr,arc_length", "+filter=none"]),
+    (
+        ["+method=plr,first_order_gain", "filter=null"],
+        ["+method=plr,first_order_gain", "+filter=none"],
+    ),
     ([*ALONE, "+filter=learnability,null"], [*ALONE, "+filter=learnability,none"]),
     ([*ALONE, "+ablation=null,x"], [*ALONE, "+ablation=none,x"]),
     (["+as=dcd", "seed=1", "+method=plr"], ["seed=1", "+method=plr", "+as=dcd"]),

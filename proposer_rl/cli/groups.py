@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import MissingConfigException
+from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
@@ -203,6 +203,8 @@ def explained(error: Exception) -> str:
     """Returns one line on an error in composing: an unknown file or key with those that exist."""
     if isinstance(error, MissingConfigException) and error.options:
         return f"{error.missing_cfg_file}: unknown; choose one of: {', '.join(error.options)}"
+    if isinstance(error, OverrideParseException):
+        return f"{error.override}: {one_line(error)}"
     cause: Any = error.__cause__
     if isinstance(cause, ConfigAttributeError | ConfigKeyError):
         holder = cause.parent_node
