@@ -79,7 +79,6 @@ WRONG = [
     ("solver.ppo.horizon=1000000000", "horizon=1000000000: a rollout takes at least "),
     # one of a few
     ("precision=fp8", "precision='fp8': input should be 'auto', 'fp32' or 'bf16'"),
-    ("compute.compile=true", "compute.compile=True: compiles for a GPU, and this run is computed"),
     ("compute.device=abacus", "compute.device='abacus': must be auto, cpu or a usable one"),
     ("compute.device=meta", "compute.device='meta': must be auto, cpu or a usable one"),
     ("proposer.action.kind=golden", "proposer.action"),
@@ -101,12 +100,6 @@ WRONG = [
         "solver.ppo.continue_episodes=True: this Solver reads its level once for a whole rollout",
     ),
     ("solver.ppo.minibatches=129", "solver.ppo.minibatches=129: must be at most the 128"),
-    ("compute.workers=2", "compute.workers=2: there are workers only with"),
-    ("compute.worker_devices=[cpu]", "compute.worker_devices=['cpu']: there are workers only"),
-    (
-        "compute.ray_address=auto",
-        "compute.ray_address=auto: is of use only with compute.collector=ray",
-    ),
     ("task.maze.height=3", "task.network.channels=[64, 128, 256] halve a 3x10 maze to nothing"),
     ("task.network.channels=[64,64,64,8]", "with a single number on a 10x10 maze"),
     ("task.maze.max_steps=5", "task.maze.max_steps=5 must be at least 12, the path length of"),

@@ -192,8 +192,6 @@ def task_maker(values: Mapping[str, Any]) -> partial[Any]:
     """Returns a function that makes the task of these settings from ``solver`` and ``context``."""
     target = f"task._target_={values.get('_target_')}"
     make, own = located("task", values)
-    for missing in set(GIVEN_TO_TASKS) - {*inspect.signature(make).parameters}:
-        raise ConfigError(f"{target}: makes no task: it takes no argument {missing!r}")
     with key("task", f"{target}: ", CANNOT_BE_CALLED):
         return partial(make, **arguments(make, own, GIVEN_TO_TASKS))
 
