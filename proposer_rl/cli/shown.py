@@ -5,7 +5,6 @@ Training is given this module and knows nothing of what draws; figures take a wh
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,19 +13,13 @@ from rich.console import Console
 
 from proposer_rl.cli.errors import say
 from proposer_rl.report.terminal import find_progress, overview
-from proposer_rl.runs.folder import FAILURE, is_rate
+from proposer_rl.runs.folder import is_rate
 from proposer_rl.runs.records import level_text
 
 
-def show_sweep(folder: Path, failed_before: Mapping[Path, int]) -> int:
-    """Lists the runs of a sweep that is over.
-
-    Returns:
-        The highest exit code of the runs that failed in it; other sweeps may have the same folder.
-    """
+def show_sweep(folder: Path) -> None:
+    """Lists the runs of a sweep that is over."""
     Console().print(overview(find_progress(folder)))
-    failed = failures(folder).items() - failed_before.items()
-    return max((int(json.loads(file.read_text())["exit_code"]) for file, _ in failed), default=0)
 
 
 def draw_run(folder: Path, title: str) -> Path:
@@ -68,8 +61,3 @@ def _cost_text(result: Mapping[str, Any], seeds: int) -> str:
         f"Cost: {result['frames']:,} frames of the Solver{together}, "
         f"{result['curriculum_frames']:,} of its curriculum, {result['seconds']:.0f} s."
     )
-
-
-def failures(folder: Path) -> dict[Path, int]:
-    """Returns the files that record failed runs in a sweep's folder, with their times."""
-    return {file: file.stat().st_mtime_ns for file in folder.rglob(FAILURE)}

@@ -7,6 +7,7 @@ sweep leaves its reason in its folder.
 from __future__ import annotations
 
 import gc
+import json
 import os
 import sys
 import traceback
@@ -24,7 +25,6 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from proposer_rl.cli import shown
 from proposer_rl.cli.errors import UNFORESEEN, ConfigError, command, exit_code, one_line, refuse
 from proposer_rl.cli.groups import (
     arranged,
@@ -66,7 +66,7 @@ class CommandFolder(Callback):
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Notes a sweep's folder, and which runs failed there before."""
         folder = _expanded(config, "hydra.sweep.dir")
-        COMMAND.append((folder, shown.failures(folder)))
+        COMMAND.append((folder, _failures(folder)))
 
 
 def main() -> None:
@@ -100,8 +100,13 @@ def _compose_and_run() -> None:
             raise
         refuse(cause, *(folder for folder, _ in COMMAND))
     for folder, failed_before in COMMAND:
-        if failed_before is not None and (code := shown.show_sweep(folder, failed_before)):
-            sys.exit(code)
+        if failed_before is not None:
+            from proposer_rl.cli.shown import show_sweep
+
+            show_sweep(folder)
+            failed = _failures(folder).items() - failed_before.items()
+            codes = [int(json.loads(file.read_text())["exit_code"]) for file, _ in failed]
+            sys.exit(max(codes, default=0))
 
 
 @hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="train")
@@ -116,7 +121,8 @@ def _main(hydra_config: DictConfig) -> float:
         check_groups(asked.overrides)
         check_chosen(hydra_config, about)
         with signals:  # already now: amid imports is no place to stop
-            from proposer_rl.cli.config import read_config  # only now: it takes seconds
+            from proposer_rl.cli import shown  # only now: it takes seconds
+            from proposer_rl.cli.config import read_config
             from proposer_rl.cli.run import train
 
             return train(read_config(hydra_config), asked, signals, shown)
@@ -161,6 +167,11 @@ def _expanded(config: DictConfig, key: str) -> Path:
             OmegaConf.update(config, key, str(path))
             config.hydra.overrides.hydra.append(override(key, path))  # for a sweep's jobs
     return path.absolute()
+
+
+def _failures(folder: Path) -> dict[Path, int]:
+    """Returns the files that record failed runs in a sweep's folder, with their times."""
+    return {file: file.stat().st_mtime_ns for file in folder.rglob(FAILURE)}
 
 
 def _record_failure(folder: Path, error: Exception) -> str:
