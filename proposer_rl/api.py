@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -131,10 +132,14 @@ class Run:
     """A run's folder, read.
 
     Attributes:
-        folder: what ``bin/watch``, ``bin/report``, ``bin/eval`` and ``bin/play`` take, too.
+        folder: its path, which is made absolute; what ``bin/watch``, ``bin/report``, ``bin/eval``
+            and ``bin/play`` take, too.
     """
 
     folder: Path
+
+    def __init__(self, folder: str | PathLike[str]) -> None:
+        object.__setattr__(self, "folder", Path(folder).expanduser().absolute())
 
     @property
     def metrics(self) -> pd.DataFrame:
@@ -231,8 +236,10 @@ def train(
         DivergedError: if a number is not finite; the checkpoint before stays.
         Interrupted: if a signal asked the run to stop; all is saved then.
     """
+    state = random.getstate()
     from proposer_rl.cli.compose import compose_and_run
 
+    random.setstate(state)  # rich, which shows a run, draws from it as it is imported
     given: dict[str, tuple[Any, Any, str]] = {
         "scale": (scale, str, "a name"),
         "filter": (filter, str | Mapping, "a name, settings"),

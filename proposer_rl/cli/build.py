@@ -89,11 +89,6 @@ def make_task(config: RunConfig) -> Task:
             "where the task makes its levels",
             stacklevel=2,
         )
-    if compute.compile and task.device.type != "cuda":
-        raise ConfigError(
-            "compute.compile=True: compiles for a GPU, and this run is computed on "
-            f"{task.device.type}; leave False"
-        )
     return task
 
 
@@ -155,17 +150,6 @@ def _curriculum(
 def _workers(config: RunConfig, task: Task) -> Workers | None:
     """Returns where the replicas are trained; None for this process."""
     compute, copies = config.compute, config.proposer.rollouts
-    if compute.collector == "single":
-        for name in ("workers", "worker_devices"):
-            if getattr(compute, name) is not None:
-                raise ConfigError(
-                    f"compute.{name}={getattr(compute, name)}: there are workers only with "
-                    "compute.collector=multiprocess or ray"
-                )
-    if compute.collector != "ray" and compute.ray_address is not None:
-        raise ConfigError(
-            f"compute.ray_address={compute.ray_address}: is of use only with compute.collector=ray"
-        )
     if compute.collector == "single":
         return None
     if compute.collector == "ray" and find_spec("ray") is None:

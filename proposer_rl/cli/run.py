@@ -15,20 +15,19 @@ from signal import Signals
 from typing import Any, Protocol
 
 import torch
-from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
 from proposer_rl.cli.build import Made, build, parts
 from proposer_rl.cli.config import RunConfig, stored_config
 from proposer_rl.cli.errors import ConfigError, one_line, say
-from proposer_rl.cli.groups import overrides
+from proposer_rl.cli.groups import Invocation
 from proposer_rl.cli.help import choices, needs
 from proposer_rl.cli.loggers import logger
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import DivergedError
 from proposer_rl.meta.workers import WorkersError
-from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, override_value
+from proposer_rl.recipes import CONFIG_FOLDER, override_value
 from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
 from proposer_rl.runs.folder import PROPOSER, RunFolder, storage, write_atomically
 from proposer_rl.runs.process import Interrupted, Status, StopSignals, locked, processor
@@ -59,28 +58,28 @@ class Shown(Protocol):
         """Prints the results."""
 
 
-def train(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> float:
+def train(config: RunConfig, asked: Invocation, signals: StopSignals, shown: Shown) -> float:
     """Carries out a run for the command line; where it is stopped, says how it goes on, and exits.
 
     Returns:
         The headline measurement at the end, e.g. for a Hydra sweeper.
     """
     try:
-        return carry_out(config, path, signals, shown)
+        return carry_out(config, asked, signals, shown)
     except Interrupted as stop:
         name = Signals(stop.signum).name
-        say(f"Stopped by {name}; all is saved. To go on: {to_go_on(path)}")
+        say(f"Stopped by {name}; all is saved. To go on: {to_go_on(asked)}")
         if "SUBMITIT_EXECUTOR" in os.environ:  # the sweep that sent this job waits for its result
             raise
         sys.exit(stop.exit_code)
     except KeyboardInterrupt:
         stopped = "Stopped at once; what came after the last checkpoint is lost"
-        say(f"{stopped}. To go on: {to_go_on(path)}")
+        say(f"{stopped}. To go on: {to_go_on(asked)}")
         raise
 
 
 @torch.inference_mode(False)  # also where it is called without gradients
-def carry_out(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> float:
+def carry_out(config: RunConfig, asked: Invocation, signals: StopSignals, shown: Shown) -> float:
     """Makes the parts of an experiment, and runs it in a folder that it locks meanwhile.
 
     It is called inside the context of the signals that may ask the run to stop.
@@ -92,18 +91,18 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals, shown: Shown)
         Interrupted: if a signal asked the run to stop; all is saved then.
     """
     status = Status(config.proposer.meta_episode_length)
-    config = as_begun(config, path)
+    config = as_begun(config, asked.folder)
     made = parts(config, signals, status)  # whatever is wrong with the input is found here
     try:
         checked(TaskFacts, made.task.facts, "task")  # as the run's readers will at its end
     except ValueError as error:
         raise ConfigError(one_line(error)) from error
-    with locked(path):
+    with locked(asked.folder):
         try:
-            result = proceed(config, made, path, signals, status, shown)
+            result = proceed(config, made, asked, signals, status, shown)
             signals.deliver()  # of a sweep the next run is not to begin
         except Interrupted as stop:
-            stop.folder = path
+            stop.folder = asked.folder
             raise
         except WorkersError as error:
             raise WorkersError(f"compute.{error}") from error
@@ -114,9 +113,15 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals, shown: Shown)
 
 
 def proceed(
-    config: RunConfig, made: Made, path: Path, signals: StopSignals, status: Status, shown: Shown
+    config: RunConfig,
+    made: Made,
+    asked: Invocation,
+    signals: StopSignals,
+    status: Status,
+    shown: Shown,
 ) -> dict[str, Any]:
     """Begins a run, resumes it, or says that it is finished; returns its summary."""
+    path = asked.folder
     folder = RunFolder(path)
     # What `auto` has become, so that a run goes on in the same precision elsewhere.
     precision: Any = made.task.precision
@@ -127,7 +132,7 @@ def proceed(
         return finished
     with logger(config.logger, path, run_name(config), asdict(config)) as log:
         experiment = build(config, made, folder, signals, status, log)
-        facts = identity(experiment, config)
+        facts = identity(experiment, config, asked)
         described = {"planned_updates": config.schedule.updates, "task": made.task.facts}
         folder.write_json("run.json", {**facts, **described})
         try:
@@ -241,7 +246,7 @@ def run_name(config: RunConfig) -> str:
     return f"{config.method}{ablation}_seed_{'-'.join(map(str, config.seeds))}"
 
 
-def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
+def identity(experiment: Experiment, config: RunConfig, asked: Invocation) -> dict[str, Any]:
     """Returns what the run is, and what it is made with: method, seeds, machine, versions."""
     device = experiment.task.device
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else ""
@@ -253,9 +258,9 @@ def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
         "ablation": config.ablation,
         "seed": config.seed,
         "seeds": config.seeds,
-        "about": _about(config),
-        "overrides": overrides(),
-        "arguments": {"config_dir": _config_folder(), "pythonpath": _python_path()},
+        "about": _about(config, asked.config_dir),
+        "overrides": asked.overrides,
+        "arguments": {"config_dir": asked.config_dir, "pythonpath": asked.python_path},
         "solver_parameters": parameters // len(config.seeds),
         "device": f"{device.type} {name}".strip(),
         "machine": f"{processor()}, {os.cpu_count()} cores, {platform.system()}",
@@ -270,13 +275,13 @@ def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
     }
 
 
-def to_go_on(path: Path) -> str:
-    """Returns the command that resumes the run in a folder."""
-    paths, config = _python_path(), _config_folder()
+def to_go_on(asked: Invocation) -> str:
+    """Returns the command that resumes a run."""
+    paths, config = asked.python_path, asked.config_dir
     before = [f"PYTHONPATH={shlex.quote(paths)}"] if paths else []
     options = ["--config-dir", config] if config else []
-    own = [word for word in overrides() if not word.startswith("+sweep=")]
-    words = shlex.join([*options, *own, f"hydra.run.dir={quoted(str(path))}"])
+    own = [word for word in asked.overrides if not word.startswith("+sweep=")]
+    words = shlex.join([*options, *own, f"hydra.run.dir={quoted(str(asked.folder))}"])
     return " ".join([*before, "bin/train", words])
 
 
@@ -288,32 +293,10 @@ def quoted(path: str) -> str:
     return override_value(path)
 
 
-def _about(config: RunConfig) -> dict[str, str]:
+def _about(config: RunConfig, own: str | None) -> dict[str, str]:
     """Returns what method and ablation do, by the first lines of their files."""
-    own = _config_folder()
     folders = [CONFIG_FOLDER, *([Path(own)] if own else [])]
     chosen = {"method": config.method, "ablation": config.ablation}
     said = {group: choices(group, folders).get(name, "") for group, name in chosen.items()}
     needed = needs(folders).get(config.method)
     return said if needed is None else {**said, "needs": ", ".join(needed)}
-
-
-def _config_folder() -> str | None:
-    """Returns the folder given with ``--config-dir``; None without."""
-    sources = HydraConfig.get().runtime.config_sources
-    given = (source.path for source in sources if source.provider == "command-line")
-    return next(map(_from_here, given), None)
-
-
-def _python_path() -> str | None:
-    """Returns the caller's PYTHONPATH without the checkout, which bin/ adds."""
-    own = str(PACKAGE.parent)
-    given = [part for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part]
-    return os.pathsep.join(_from_here(part) for part in given if part != own) or None
-
-
-def _from_here(path: str) -> str:
-    """Returns a path relative to the working folder if it lies inside, else unchanged."""
-    inside = Path(path).resolve()
-    here = Path.cwd().resolve()
-    return str(inside.relative_to(here)) if inside.is_relative_to(here) else path

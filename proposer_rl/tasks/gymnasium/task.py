@@ -21,7 +21,7 @@ from torchrl import envs
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase, Transform
 
-from proposer_rl.extras import install_command
+from proposer_rl.extras import install_command, where_to_look
 from proposer_rl.learning import SolverSettings, in_first_episode
 from proposer_rl.settings import settings
 from proposer_rl.streams import Streams
@@ -332,11 +332,9 @@ def _named(env_id: str, extra: str | None) -> Iterator[None]:
     except (ImportError, gymnasium.error.DependencyNotInstalled) as error:
         how = f"install it with: {install_command(extra)}" if extra else "install it"
         reason = " ".join(str(error).split())
-        module, colon, _ = env_id.partition(":")
-        own = ""
-        if colon and f"No module named {module!r}" in reason:
-            own = "; if it is your own module, name its folder, as in PYTHONPATH=. bin/train ..."
-        raise ValueError(f"env_id={env_id}: a package is missing; {how} ({reason}){own}") from error
+        if not extra and (own := where_to_look(error)):
+            raise ValueError(f"env_id={env_id}: {reason}{own}") from error
+        raise ValueError(f"env_id={env_id}: a package is missing; {how} ({reason})") from error
     except gymnasium.error.Error as error:
         unknown = isinstance(error, gymnasium.error.NameNotFound) and ":" not in env_id
         own = "; one's own comes after its module, as module:Name-v0" if unknown else ""
