@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from os import PathLike
 from typing import Any
 
@@ -23,12 +22,10 @@ from proposer_rl.models import ActorCritic
 from proposer_rl.task import Task
 from proposer_rl.tasks.gymnasium.spaces import (
     NUMBERS_ENTRY,
-    Scaled,
+    Layout,
     assembled,
-    channels_first,
     in_order,
     leaves,
-    observation_parts,
 )
 from proposer_rl.tasks.gymnasium.task import GymnasiumTask
 
@@ -51,8 +48,8 @@ class Policy(TensorDictModuleBase):
     Args:
         agent: one Solver, with ``copies=1``.
         observation_space, action_space: of one environment, without a batch.
-        plain: whether the agent knows these spaces as
-            :func:`~proposer_rl.tasks.gymnasium.spaces.plain_env` makes them; else it takes each
+        plain: whether the agent sees and acts by a
+            :class:`~proposer_rl.tasks.gymnasium.spaces.Layout` of these spaces; else it takes each
             part by its name, and gives actions as they are.
     """
 
@@ -62,7 +59,7 @@ class Policy(TensorDictModuleBase):
         super().__init__()
         self.agent = agent
         self.observation_space, self.action_space = observation_space, action_space
-        self._layout = observation_parts(observation_space) if plain else None
+        self._layout = Layout(observation_space, action_space) if plain else None
         self._observed = [_key(name) or NUMBERS_ENTRY for name, _ in leaves(observation_space)]
         acted = [_key(name, "action") for name, _ in leaves(action_space)]
         remembered = [BEGINS, *agent.memory] if agent.memory else []
@@ -168,7 +165,7 @@ class Policy(TensorDictModuleBase):
         if self._layout is None:
             entries = dict(zip(self._observed, shown, strict=True))
         else:
-            entries = _plain_entries(self._layout, shown)
+            entries = self._layout.entries(shown)
         if agent.memory:
             assert begins is not None
             entries[BEGINS] = begins.unsqueeze(-1)
@@ -185,7 +182,7 @@ class Policy(TensorDictModuleBase):
         drawn = distribution.sample() if sample else distribution.mode
         after = [state.get(key) for key in agent.memory_keys]
         action, *after = (part[0].reshape((*batch, *part.shape[2:])) for part in (drawn, *after))
-        own = [action] if self._layout is None else _own_actions(self.action_space, action)
+        own = [action] if self._layout is None else self._layout.own_actions(action)
         return own, tuple(after) or None
 
     def _batch(self, shown: list[Tensor], batch: torch.Size | None = None) -> torch.Size:
@@ -250,56 +247,3 @@ class _Exported(nn.Module):
         actions, after = self.policy.act(shown, memory, episode_start, sample=self.sample)
         action = assembled(self.policy.action_space, iter(actions))
         return action if after is None else (action, after)
-
-
-def _plain_entries(
-    layout: tuple[dict[str, Space], dict[str, spaces.Box], spaces.Dict], shown: list[Tensor]
-) -> dict[str, Tensor]:
-    """Returns what ``plain_env`` makes of observations, as float32, from their parts [*B, ...]."""
-    parts, images, numbers = layout
-    named = dict(zip(parts, shown, strict=True))
-    entries = {f"image {name}": _of_three_axes(named[name], box) for name, box in images.items()}
-    if numbers.spaces:
-        rows = [_row(named[name], part) for name, part in numbers.spaces.items()]
-        entries[NUMBERS_ENTRY] = torch.cat(rows, -1)
-    return entries if len(entries) > 1 else {NUMBERS_ENTRY: next(iter(entries.values()))}
-
-
-def _row(seen: Tensor, space: Any) -> Tensor:
-    """Returns numbers [*B, ...] of a space as float32 [*B, D], choices one-hot."""
-    row = seen.reshape(*seen.shape[: seen.ndim - len(space.shape)], -1)
-    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
-        counts = np.ravel(space.n if isinstance(space, spaces.Discrete) else space.nvec).tolist()
-        starts = np.ravel(space.start).tolist()
-        choices = zip(row.unbind(-1), starts, counts, strict=True)
-        hot = [x[..., None] == torch.arange(s, s + n, device=x.device) for x, s, n in choices]
-        row = torch.cat(hot, -1)
-    return row.float()
-
-
-def _of_three_axes(image: Tensor, box: spaces.Box) -> Tensor:
-    """Returns images [*B, ...] with one axis of channels, as float32."""
-    if len(box.shape) == 2:
-        image = image.unsqueeze(-1)
-    elif len(box.shape) == 4:
-        first = channels_first(box.shape[1:])
-        image = image.flatten(-4, -3) if first else image.movedim(-4, -2).flatten(-2)
-    return image.float()
-
-
-def _own_actions(space: Space, action: Tensor) -> list[Tensor]:
-    """Returns the parts of a space's actions, from those that ``plain_env`` takes, [*B, ...]."""
-    rows = action.unsqueeze(-1) if isinstance(space, spaces.Discrete) else action
-    parts = [part for _, part in leaves(space)]
-    own = []
-    for part, row in zip(parts, rows.split([math.prod(p.shape) for p in parts], -1), strict=True):
-        if isinstance(part, spaces.Box):
-            scaled = Scaled(part)
-            ends = (scaled.middle, scaled.reach, scaled.low, scaled.high)
-            middle, reach, low, high = (torch.as_tensor(end, device=row.device) for end in ends)
-            row = (middle + reach * row).clamp(low, high)
-        row = row.reshape((*row.shape[:-1], *part.shape))
-        if not isinstance(part, spaces.Box):
-            row = row + torch.as_tensor(getattr(part, "start", 0), device=row.device)
-        own.append(row.to(torch.from_numpy(np.empty(0, part.dtype)).dtype))
-    return own

@@ -32,7 +32,7 @@ from proposer_rl.learning import PPO, PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.batched_env import plays
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings
-from proposer_rl.tasks.gymnasium.spaces import plain_env
+from proposer_rl.tasks.gymnasium.spaces import Layout, in_order, typed
 from proposer_rl.tasks.policy import Policy, policy_of
 from tests.processes import ROOT, python
 from tests.tasks.gymnasium.odd import LIMIT, Line, odd
@@ -96,14 +96,6 @@ def solver(env_id: str, memory: int | None = None) -> tuple[PPO, Policy]:
     return learner, policy_of(task, learner)
 
 
-class Recording(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Keeps what the environment is given."""
-
-    def step(self, action: Any) -> Any:
-        self.given = action
-        return self.env.step(action)
-
-
 def same(one: Any, other: Any) -> bool:
     """Whether two observations or actions are equal, in structure, numbers and their types."""
     if isinstance(one, dict):
@@ -117,34 +109,27 @@ def same(one: Any, other: Any) -> bool:
 @pytest.mark.parametrize("memory", [None, 8])
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_acts_as_the_solver_in_its_environment(kind: str, memory: int | None) -> None:
-    """In Gymnasium's loop the same actions as the agent's on what ``plain_env`` shows it."""
+    """In Gymnasium's loop the same actions as the agent's on what the task shows it."""
     learner, policy = solver(KINDS[kind], memory)
     agent, env = learner.agent, gymnasium.make(KINDS[kind])
-    own = plain_env(Recording(gymnasium.make(KINDS[kind])))
-    recorder: Any = own
-    while not isinstance(recorder, Recording):
-        recorder = recorder.env
+    layout = Layout(env.observation_space, env.action_space)
     state, taken = None, []
     for seed in range(4):  # of which every other draws its actions
         observation, _ = env.reset(seed=seed)
-        plain, _ = own.reset(seed=seed)
         kept, begins, over = agent.no_memory(TensorDict({}, [1, 1])), True, False
         while not over:
-            shown = plain if isinstance(plain, dict) else {"observation": plain}
-            entries = {name: torch.as_tensor(x)[None, None] for name, x in shown.items()}
-            entries = {k: x if x.dtype == torch.uint8 else x.float() for k, x in entries.items()}
+            plain = in_order(env.observation_space, typed(env.observation_space, observation))
+            entries = layout.entries(torch.as_tensor(part)[None, None] for part in plain)
             seen = TensorDict({**entries, **kept, "is_init": [[[begins]]]}, [1, 1])
             with torch.no_grad():
                 after = agent(seen)
             kept = {name: after["next", name] for name in agent.memory}
             torch.manual_seed(len(taken))
             distribution = agent.distribution(after)
-            chosen = (distribution.sample() if seed % 2 else distribution.mode)[0, 0].numpy()
-            shift = own.action_space.start if isinstance(own.action_space, spaces.Discrete) else 0
-            plain, *_ = own.step(chosen + shift)
+            chosen = (distribution.sample() if seed % 2 else distribution.mode)[0, 0]
             torch.manual_seed(len(taken))
             action, state = policy.predict(observation, state, begins, seed % 2 == 0)
-            assert env.action_space.contains(action) and same(action, recorder.given)
+            assert env.action_space.contains(action) and same(action, layout.taken(chosen))
             assert (state is None) == (memory is None)
             observation, _, terminated, truncated, _ = env.step(action)
             over, begins = terminated or truncated, False

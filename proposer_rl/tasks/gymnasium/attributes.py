@@ -121,8 +121,6 @@ def _in_place_of(before: Any, value: Any, path: str) -> Any:
             f"name: {path}{'.0' * len(shape)}"
         )
     if isinstance(before, bool | np.bool_):
-        if value not in (0, 1):
-            raise AttributeRefusedError(f"{path} is true or false: 1 or 0, not {value:g}")
         return bool(value)
     if isinstance(before, torch.Tensor):
         return torch.full_like(before, value)

@@ -17,14 +17,14 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
-from torchrl.data import Binary, Categorical, Composite, MultiCategorical, Unbounded
+from torch.utils._pytree import tree_map
+from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from proposer_rl.models import available_cores, check_torch_defaults
 from proposer_rl.tasks.gymnasium.answers import SuccessSettings, UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, ParameterSettings, Play
-from proposer_rl.tasks.gymnasium.spaces import NUMBERS_ENTRY
+from proposer_rl.tasks.gymnasium.spaces import Layout, in_order
 from proposer_rl.tasks.parameters import SEED
 
 Vectorization = Literal["sync", "async"]
@@ -39,7 +39,7 @@ class GymnasiumEnv(EnvBase):
     """A batch of environments of Gymnasium, stepped by its vector environments.
 
     An environment whose episode is over begins its level again, from the same seed. Observations
-    are those of :func:`~proposer_rl.tasks.gymnasium.spaces.plain_env`, ``observation`` and perhaps
+    are those of a :class:`~proposer_rl.tasks.gymnasium.spaces.Layout`, ``observation`` and perhaps
     images; ``success``, bool [*B, 1], whether the step ended an episode that counts as one; and
     ``is_init``, bool [*B, 1], whether the step begins one. ``reward`` is scaled.
 
@@ -77,6 +77,8 @@ class GymnasiumEnv(EnvBase):
             self._vector = SyncVectorEnv(players, autoreset_mode=AutoresetMode.DISABLED)
         else:
             self._vector = ProcessVectorEnv(players, available_cores())
+        acts = self._vector.single_action_space
+        self._layout = Layout(self._vector.single_observation_space, acts)
         self._make_specs()
 
     def set_levels(self, levels: TensorDictBase) -> None:
@@ -98,71 +100,49 @@ class GymnasiumEnv(EnvBase):
         return self._batched(seen, success=none, is_init=~none)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        space = self._vector.single_action_space
-        actions = as_actions(tensordict["action"].flatten(0, self.batch_dims - 1), space)
+        actions = self._layout.taken(tensordict["action"].flatten(0, self.batch_dims - 1))
         seen, rewards, terminated, truncated, info = self._vector.step(actions)
         none = np.zeros_like(terminated)
         return self._batched(
             seen,
             success=info.get("success", none),
             is_init=none,
-            reward=self._finite("reward", rewards * self._reward_scale),
+            reward=rewards * self._reward_scale,
             terminated=terminated,
             truncated=truncated,
             done=terminated | truncated,
         )
 
     def _batched(self, seen: Any, **entries: NDArray[Any]) -> TensorDict:
-        """Returns entries [n, ...] of all environments as [*B, ...], single numbers as [*B, 1]."""
-        observed = seen if isinstance(seen, dict) else {NUMBERS_ENTRY: seen}
-        numbers = {key: self._finite(key, entry) for key, entry in observed.items()}
-        tensors = {
-            key: torch.as_tensor(entry).reshape(*self.batch_size, *(entry.shape[1:] or (1,)))
-            for key, entry in {**numbers, **entries}.items()
-        }
-        return TensorDict(tensors, self.batch_size).to(self.device)
-
-    def _finite(self, name: str, entry: NDArray[Any]) -> NDArray[Any]:
-        """Returns numbers [n, ...] as float32; bytes as they are.
+        """Returns entries [n, ...] of all environments as [*B, ...], single numbers as [*B, 1].
 
         Raises:
-            UnfitEnvironmentError: for one that is not finite, naming the level.
+            UnfitEnvironmentError: for a number that is not finite as float32, naming the level.
         """
-        if entry.dtype == np.uint8:
-            return entry
-        numbers = entry.astype(np.float32, copy=False)
-        finite = np.isfinite(numbers)
-        if not finite.all():
-            first = int(finite.reshape(len(finite), -1).all(-1).argmin())
-            raise UnfitEnvironmentError(
-                f"{name}: NaN or infinity, or a number beyond float32, on the level "
-                f"{self._plays[first]}"
-            )
-        return numbers
+        shown = map(torch.as_tensor, in_order(self._layout.observation_space, seen))
+        found = self._layout.entries(shown)
+        for key, entry in entries.items():
+            one = torch.as_tensor(entry).unsqueeze(-1)
+            found[key] = one.float() if one.is_floating_point() else one
+        for key, one in found.items():
+            if one.is_floating_point() and not one.isfinite().all():
+                first = int(one.isfinite().flatten(1).all(-1).int().argmin())
+                raise UnfitEnvironmentError(
+                    f"{key}: NaN or infinity, or a number beyond float32, on the level "
+                    f"{self._plays[first]}"
+                )
+        tensors = {key: one.reshape(*self.batch_size, *one.shape[1:]) for key, one in found.items()}
+        return TensorDict(tensors, self.batch_size).to(self.device)
 
     def _make_specs(self) -> None:
         batch = self.batch_size
-        acts = self._vector.single_action_space
-        seen = self._vector.single_observation_space
-        boxes = seen.spaces if isinstance(seen, spaces.Dict) else {NUMBERS_ENTRY: seen}
-        observed = {
-            name: Unbounded(
-                (*batch, *(box.shape or ())),
-                dtype=torch.uint8 if box.dtype == np.uint8 else torch.float32,
-            )
-            for name, box in boxes.items()
-        }
+        seen = {name: spec.expand(*batch, *spec.shape) for name, spec in self._layout.seen.items()}
         flag = Binary(1, (*batch, 1), dtype=torch.bool)
         flags = {name: flag.clone() for name in FLAGS}
-        self.observation_spec = Composite({**observed, **flags}, shape=batch).to(self.device)
-        if isinstance(acts, spaces.Discrete):
-            self.action_spec = Categorical(int(acts.n), shape=batch)
-        elif isinstance(acts, spaces.MultiDiscrete):
-            options = torch.as_tensor(acts.nvec)
-            self.action_spec = MultiCategorical(options, (*batch, len(options)))
-        else:
-            self.action_spec = Unbounded((*batch, *(acts.shape or ())))
-        self.action_spec = self.action_spec.to(self.device)
+        self.observation_spec = Composite({**seen, **flags}, shape=batch).to(self.device)
+        self.action_spec = self._layout.acts.expand(*batch, *self._layout.acts.shape).to(
+            self.device
+        )
         self.reward_spec = Unbounded((*batch, 1), device=self.device)
         ends = {key: flag.clone() for key in ("done", "terminated", "truncated")}
         self.done_spec = Composite(ends, shape=batch).to(self.device)
@@ -179,12 +159,6 @@ def plays(levels: TensorDictBase) -> list[Play]:
         Play(dict(zip(columns, row, strict=True)), seed)
         for seed, *row in zip(seeds, *columns.values(), strict=True)
     ]
-
-
-def as_actions(actions: Tensor, space: spaces.Space[Any]) -> NDArray[Any]:
-    """Returns actions [n, ...] of a policy as environments of a space take them."""
-    taken = actions.cpu().numpy()
-    return taken + space.start if isinstance(space, spaces.Discrete) else taken
 
 
 class LostProcessError(RuntimeError):
@@ -230,18 +204,25 @@ class ProcessVectorEnv:
     def reset(self, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begins an episode everywhere, or where the options' ``reset_mask``, bool [n], says so."""
         parts = [(options and {"reset_mask": options["reset_mask"][part]},) for part in self._parts]
-        return _joined(self._ask("reset", parts)), {}
+        return tree_map(lambda *each: np.concatenate(each), *self._ask("reset", parts)), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Takes a step in each environment, with actions [n, ...]."""
-        answers = self._ask("step", [(actions[part],) for part in self._parts])
+        shares = [tree_map(lambda rows, part=part: rows[part], actions) for part in self._parts]
+        answers = self._ask("step", [(share,) for share in shares])
         seen, *ends, infos = zip(*answers, strict=True)
         success = [
             info.get("success", np.zeros(len(part), np.bool_))
             for info, part in zip(infos, self._parts, strict=True)
         ]
         rewards, terminated, truncated, successes = map(np.concatenate, (*ends, success))
-        return _joined(seen), rewards, terminated, truncated, {"success": successes}
+        return (
+            tree_map(lambda *each: np.concatenate(each), *seen),
+            rewards,
+            terminated,
+            truncated,
+            {"success": successes},
+        )
 
     def set_attr(self, name: str, values: Sequence[Any]) -> None:
         """Sets an attribute of each environment to its value."""
@@ -309,9 +290,3 @@ def _serve(pipe: Connection, parents: Connection, make: Callable[[], Any]) -> No
             pipe.send((False, answer))
         except Exception as error:
             pipe.send((True, error))
-
-
-def _joined(parts: Sequence[Any]) -> Any:
-    if isinstance(parts[0], dict):
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return np.concatenate(parts)

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
 from proposer_rl.runs.records import written
-from proposer_rl.tasks.gymnasium.batched_env import as_actions
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, ParameterSettings, Play
 from proposer_rl.tasks.parameters import SEED
 
@@ -70,11 +70,12 @@ class Camera:
         self._player.play = play
         self._player.reset()
         frames = [self._frame()]
-        steps = [] if actions is None else list(as_actions(actions, self._player.action_space))
-        moments = {round(part * len(steps) / LATER) for part in range(1, LATER + 1)}
-        for number, action in enumerate(steps, 1):
-            self._player.step(action)
-            if number in moments:
+        steps = 0 if actions is None else len(actions)
+        taken = None if actions is None else self._player.layout.taken(actions)
+        moments = {round(part * steps / LATER) for part in range(1, LATER + 1)}
+        for number in range(steps):
+            self._player.step(tree_map(lambda rows, number=number: rows[number], taken))
+            if number + 1 in moments:
                 frames.append(self._frame())
         shares = np.ones(len(frames))
         shares[0] = 2

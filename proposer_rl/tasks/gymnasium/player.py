@@ -6,7 +6,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -23,7 +23,7 @@ from proposer_rl.tasks.gymnasium.answers import (
     stepped,
 )
 from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write_attribute
-from proposer_rl.tasks.gymnasium.spaces import plain_env
+from proposer_rl.tasks.gymnasium.spaces import Layout, typed
 from proposer_rl.tasks.parameters import SEED
 from proposer_rl.tasks.ranges import RangeSettings
 
@@ -77,15 +77,12 @@ class MakeEnvironment:
     Attributes:
         env_id, arguments, max_steps, wrappers: as of
             :class:`~proposer_rl.tasks.gymnasium.task.GymnasiumTask`.
-        as_it_is: whether observations and actions are those of the environment; else those of
-            :func:`~proposer_rl.tasks.gymnasium.spaces.plain_env`.
     """
 
     env_id: str
     arguments: Mapping[str, Any] = field(default_factory=dict)
     max_steps: int | None = None
     wrappers: Sequence[WrapperSettings] = ()
-    as_it_is: bool = False
 
     def __call__(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
         """Makes an environment with further arguments.
@@ -107,7 +104,7 @@ class MakeEnvironment:
                 env = wrapper_of(wrapper)(env)
             except Exception as error:
                 raise wrapper_error(wrapper, error) from error
-        return env if self.as_it_is else plain_env(env)
+        return env
 
     def limit(self, env: gymnasium.Env[Any, Any]) -> int | None:
         """Returns the steps after which an episode is truncated; None for never."""
@@ -177,6 +174,11 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
     def play(self, play: Play) -> None:
         self._play, self._played, self._still = play, False, False
 
+    @cached_property
+    def layout(self) -> Layout:
+        """Returns how a Solver sees the environment and acts in it."""
+        return Layout(self.observation_space, self.action_space)
+
     @property
     def in_time(self) -> bool:
         """Returns whether no time limit is reached, each counting the steps that it has seen."""
@@ -196,9 +198,10 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._set_up()
         given = self._named("option")
         try:
-            self._seen, self.last_info = self.env.reset(
+            seen, self.last_info = self.env.reset(
                 seed=self._play.seed, **({"options": given} if given else {})
             )
+            self._seen = typed(self.observation_space, seen)
         except UnfitEnvironmentError as error:
             raise UnfitEnvironmentError(f"{error}, on the level {self._play}") from error
         except Exception as error:
@@ -212,7 +215,8 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         rule = self._success
         try:
             answer = stepped(self.env.step(action))
-            self._seen, reward, terminated, truncated, self.last_info = answer
+            seen, reward, terminated, truncated, self.last_info = answer
+            self._seen = typed(self.observation_space, seen)
             self._return += reward
             over = terminated or truncated
             if rule is not None and (over or rule.once):

@@ -1,22 +1,19 @@
-"""Spaces as Solvers' networks take them: numbers, images, and actions in one array."""
+"""Spaces as Solvers' networks take them: numbers, images, and actions in one tensor."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from functools import partial
-from typing import Any, cast
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
-import gymnasium
 import numpy as np
+import torch
 from gymnasium import spaces
-from gymnasium.wrappers import TransformAction, TransformObservation
-from numpy.typing import NDArray
+from torch import Tensor
+from torchrl.data import Categorical, MultiCategorical, TensorSpec, Unbounded
 
 from proposer_rl.settings import shown
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
-
-Array = NDArray[Any]
-Env = gymnasium.Env[Any, Any]
 
 # Spaces whose values are one number or an array of them.
 NUMERIC = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
@@ -25,82 +22,146 @@ IMAGE_SIDE = 16  # pixels at least, of a map of bytes without channels
 NUMBERS_ENTRY = "observation"  # the entry of all numbers, or of the only image
 
 
-def plain_env(env: Env) -> Env:
-    """Returns an environment whose observations and actions are plain arrays.
+class Layout:
+    """Turns what environments show into tensors, and a Solver's actions into what they take.
 
-    Observations become a box: of numbers [D], where whole numbers to choose from are one-hot; or of
-    an image of three axes. Where both are seen, or several images, they are a dictionary of boxes:
-    the numbers by the name of ``observation``, each image by its own after ``image``.
+    Observations become numbers [D], where whole numbers to choose from are one-hot, or an image of
+    three axes. Where both are seen, or several images, there are several entries: the numbers by
+    the name of ``observation``, each image by its own after ``image``.
 
-    Actions become one of n, one of several n each, or a box [D] whose bounded parts go from -1 to
+    Actions become one of n, one of several n each, or numbers [D] whose bounded parts go from -1 to
     1; what is beyond a bound is clipped.
+
+    Args:
+        observation_space, action_space: of one environment.
+
+    Attributes:
+        seen: specs of the entries by name, without a batch.
+        acts: spec of the actions.
 
     Raises:
         UnfitEnvironmentError: for spaces that no network is for, saying what there is one for.
     """
-    return _with_plain_observations(_with_plain_actions(env))
 
-
-def _with_plain_observations(env: Env) -> Env:
-    space = env.observation_space
-    if isinstance(space, spaces.Box) and len(space.shape) == (3 if is_image(space) else 1):
-        return TransformObservation(env, partial(_typed, space), space)
-    parts, images, rest = observation_parts(space)
-    new: dict[str, spaces.Space[Any]] = {}
-    for name, box in images.items():
-        low, high = (_of_three_axes(end) for end in (box.low, box.high))
-        new[f"image {name}"] = spaces.Box(low, high, dtype=cast(Any, box.dtype.type))
-    if rest.spaces:
-        new[NUMBERS_ENTRY] = spaces.flatten_space(rest)
-
-    def changed(seen: Any) -> Any:
-        read = zip(parts.items(), in_order(space, seen), strict=True)
-        shown = {name: _typed(part, own) for (name, part), own in read}
-        out: dict[str, Any] = {f"image {name}": _of_three_axes(shown[name]) for name in images}
-        if rest.spaces:
-            out[NUMBERS_ENTRY] = spaces.flatten(rest, {name: shown[name] for name in rest.spaces})
-        return out if len(out) > 1 else next(iter(out.values()))
-
-    together = spaces.Dict(new) if len(new) > 1 else next(iter(new.values()))
-    return TransformObservation(env, changed, together)
-
-
-def observation_parts(
-    space: spaces.Space[Any],
-) -> tuple[dict[str, spaces.Space[Any]], dict[str, spaces.Box], spaces.Dict]:
-    """Returns all parts of an observation space by dotted names, its images, and its numbers.
-
-    Raises:
-        UnfitEnvironmentError: for a part that no network is for.
-    """
-    parts: dict[str, spaces.Space[Any]] = {}
-    for name, part in leaves(space):
-        while name in parts:  # a.b is a name with a dot, or b in a
-            name += "'"
-        parts[name] = part
-    for name, part in parts.items():
-        if not isinstance(part, NUMERIC):
-            way = "; a wrapper can make numbers of it"
-            if name:
-                way = (
-                    f", its part {name}; a wrapper can leave it out, as "
-                    "wrappers=[{gymnasium.wrappers.FilterObservation: {filter_keys: [...]}}] does"
+    def __init__(
+        self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+    ) -> None:
+        self.observation_space, self.action_space = observation_space, action_space
+        self._parts: dict[str, Any] = {}  # in the order of the space
+        for name, part in leaves(observation_space):
+            while name in self._parts:  # a.b is a name with a dot, or b in a
+                name += "'"
+            self._parts[name] = part
+        for name, part in self._parts.items():
+            if not isinstance(part, NUMERIC):
+                way = "; a wrapper can make numbers of it"
+                if name:
+                    way = (
+                        f", its part {name}; a wrapper can leave it out, as wrappers="
+                        "[{gymnasium.wrappers.FilterObservation: {filter_keys: [...]}}] does"
+                    )
+                raise UnfitEnvironmentError(
+                    f"observation space {observation_space}: there is no network for {part}{way}"
                 )
-            raise UnfitEnvironmentError(
-                f"observation space {space}: there is no network for {part}{way}"
+        nothing = [torch.from_numpy(np.zeros(p.shape, p.dtype)) for p in self._parts.values()]
+        self.seen = {
+            name: Unbounded(entry.shape, dtype=entry.dtype)
+            for name, entry in self.entries(nothing).items()
+        }
+        self._taken = [PartTaken(part) for _, part in leaves(action_space)]
+        self.acts = self._acts()
+
+    def entries(self, shown: Iterable[Tensor]) -> dict[str, Tensor]:
+        """Returns what a Solver sees: float32, or uint8 of bytes, [*B, ...] by name.
+
+        Args:
+            shown: parts of observations [*B, ...], in the order of those of their space.
+        """
+        named = sorted(zip(self._parts.items(), shown, strict=True), key=lambda one: one[0][0])
+        found, rows = {}, []
+        for (name, part), seen in named:
+            if is_image(part):
+                found[f"image {name}"] = _of_three_axes(seen, part)
+            else:
+                rows.append(_row(seen, part))
+        if rows:
+            bytes_ = all(row.dtype == torch.uint8 for row in rows)
+            found[NUMBERS_ENTRY] = torch.cat(rows if bytes_ else [row.float() for row in rows], -1)
+        found = {
+            k: seen if seen.dtype == torch.uint8 else seen.float() for k, seen in found.items()
+        }
+        return found if len(found) > 1 else {NUMBERS_ENTRY: next(iter(found.values()))}
+
+    def own_actions(self, actions: Tensor) -> list[Tensor]:
+        """Returns the parts of the space's actions, [*B, ...] each, from a Solver's."""
+        rows = actions.unsqueeze(-1) if isinstance(self.action_space, spaces.Discrete) else actions
+        parts = rows.split([taken.size for taken in self._taken], -1)
+        return [taken(row) for taken, row in zip(self._taken, parts, strict=True)]
+
+    def taken(self, actions: Tensor) -> Any:
+        """Returns a Solver's actions [*B, ...] as arrays in the structure of the action space."""
+        own = (part.numpy() for part in self.own_actions(actions.cpu()))
+        return assembled(self.action_space, own)
+
+    def _acts(self) -> TensorSpec:
+        space, parts = self.action_space, [taken.part for taken in self._taken]
+        if isinstance(space, spaces.Discrete):
+            return Categorical(int(space.n))
+        if all(isinstance(part, spaces.Box) and part.dtype.kind == "f" for part in parts):
+            return Unbounded(sum(taken.size for taken in self._taken))
+        if all(isinstance(part, NUMERIC) and not isinstance(part, spaces.Box) for part in parts):
+            return MultiCategorical([count for part in parts for count in _options(part)])
+        raise UnfitEnvironmentError(
+            f"action space {space}: there is a policy for a Discrete, a MultiDiscrete or a "
+            "MultiBinary one, for a Box of floats, and for dictionaries and tuples of either; a "
+            "wrapper can make it one"
+        )
+
+
+class PartTaken:
+    """Makes actions of a part of an action space from numbers of -1 to 1, or choices from 0 on.
+
+    Attributes:
+        part: the space.
+        size: how many numbers or choices there are.
+    """
+
+    def __init__(self, part: Any) -> None:
+        self.part, self.size = part, math.prod(part.shape or ())
+        self._dtype = torch.from_numpy(np.empty(0, part.dtype)).dtype
+        if isinstance(part, spaces.Box):  # middle + reach * number, within low and high
+            low, high = (
+                torch.from_numpy(x.astype(np.float64).ravel()) for x in (part.low, part.high)
             )
-    images = {name: cast(spaces.Box, part) for name, part in parts.items() if is_image(part)}
-    rest = spaces.Dict({name: part for name, part in parts.items() if name not in images})
-    return parts, images, rest
+            bounded = (low > -UNBOUNDED) & (high < UNBOUNDED)
+            first, last = low.where(bounded, -1.0), high.where(bounded, 1.0)
+            self._scale = (first + last) / 2, (last - first) / 2, low, high
+
+    def __call__(self, row: Tensor) -> Tensor:
+        """Returns actions [*B, ...] of the part, from rows [*B, D]."""
+        if isinstance(self.part, spaces.Box):
+            middle, reach, low, high = (end.to(row.device) for end in self._scale)
+            row = (middle + reach * row).clamp(low, high)
+        own = row.reshape((*row.shape[:-1], *self.part.shape))
+        if not isinstance(self.part, spaces.Box):
+            own = own + torch.as_tensor(getattr(self.part, "start", 0), device=row.device)
+        return own.to(self._dtype)
 
 
-def _typed(space: Any, seen: Any) -> Array:
-    """Returns an observation in the type of its space, of numbers.
+def typed(space: spaces.Space[Any], seen: Any) -> Any:
+    """Returns an observation whose numbers have the types of its space, in its order.
 
     Raises:
-        UnfitEnvironmentError: where it has another shape, or would become another number. A float
-            beyond its bounds does not: nothing here depends on them.
+        UnfitEnvironmentError: where a part has another shape, or would become another number. A
+            float beyond its bounds does not: nothing here depends on them.
     """
+    parts = zip(leaves(space), in_order(space, seen), strict=True)
+    return assembled(space, (_typed(part, one) for (_, part), one in parts))
+
+
+def _typed(space: Any, seen: Any) -> Any:
+    if not isinstance(space, NUMERIC):
+        return seen
     array = np.asarray(seen)
     fits = array.shape == space.shape and array.dtype.kind in "biuf"
     # Floats of a box are not looked at one by one: that would take longer than many a step.
@@ -114,8 +175,7 @@ def _typed(space: Any, seen: Any) -> Array:
             f"the environment shows {shown(seen)}, {array.dtype} {list(array.shape)}; its "
             f"observation space is {space}"
         )
-    typed: Array = array.astype(space.dtype, copy=False)
-    return typed
+    return array.astype(space.dtype, copy=False)
 
 
 def is_image(space: spaces.Space[Any]) -> bool:
@@ -148,88 +208,33 @@ def channels_first(shape: tuple[int, ...]) -> bool:
     )
 
 
-def _of_three_axes(image: Array) -> Array:
-    """Returns a grey image with an axis of channels, stacked images with theirs along it."""
-    if image.ndim == 2:
-        return image[..., None]
-    if image.ndim == 3:
-        return image
-    if channels_first(image.shape[1:]):
-        return image.reshape(-1, *image.shape[2:])
-    return image.transpose(1, 2, 0, 3).reshape(*image.shape[1:3], -1)
+def _row(seen: Tensor, space: Any) -> Tensor:
+    """Returns numbers [*B, ...] of a space in a row [*B, D], choices one-hot."""
+    row = seen.reshape(*seen.shape[: seen.ndim - len(space.shape)], -1)
+    if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+        return row
+    choices = zip(row.unbind(-1), np.ravel(space.start).tolist(), _options(space), strict=True)
+    hot = [x[..., None] == torch.arange(s, s + n, device=x.device) for x, s, n in choices]
+    return torch.cat(hot, -1)
 
 
-def _with_plain_actions(env: Env) -> Env:
-    space = env.action_space
-    if isinstance(space, spaces.Discrete):
-        return env
-    parts = [part for _, part in leaves(space)]
-    new: spaces.Space[Any]
-    read: list[Callable[[Array], Any]]
-    if all(isinstance(part, spaces.Box) and part.dtype.kind == "f" for part in parts):
-        boxes = [Scaled(cast(spaces.Box, part)) for part in parts]
-        read, least = [*boxes], [box.least for box in boxes]
-        new = spaces.Box(np.concatenate(least), -np.concatenate(least))
-        sizes = [len(part) for part in least]
-    elif all(isinstance(part, NUMERIC) and not isinstance(part, spaces.Box) for part in parts):
-        options = [_options(part) for part in parts]
-        new = spaces.MultiDiscrete(np.concatenate(options))
-        sizes = [len(part) for part in options]
-        read = [partial(_chosen, part) for part in parts]
-    else:
-        raise UnfitEnvironmentError(
-            f"action space {space}: there is a policy for a Discrete, a MultiDiscrete or a "
-            "MultiBinary one, for a Box of floats, and for dictionaries and tuples of either; a "
-            "wrapper can make it one"
-        )
-    ends = np.cumsum(sizes)[:-1]
-
-    def changed(action: Array) -> Any:
-        own = [make(part) for make, part in zip(read, np.split(action, ends), strict=True)]
-        return assembled(space, iter(own))
-
-    return TransformAction(env, changed, new)
-
-
-class Scaled:
-    """Makes numbers from -1 to 1 those of a box; unbounded ones stay as they are.
-
-    Attributes:
-        low, high, middle, reach: an action is ``middle + reach * number``, clipped to the bounds.
-        least: of the numbers.
-    """
-
-    def __init__(self, box: spaces.Box) -> None:
-        self.box = box
-        low, high = (end.astype(np.float64).ravel() for end in (box.low, box.high))
-        self.low, self.high = low, high
-        bounded = (low > -UNBOUNDED) & (high < UNBOUNDED)
-        first, last = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
-        self.middle, self.reach = (first + last) / 2, (last - first) / 2
-        self.least = np.where(bounded, -1.0, -np.inf).astype(np.float32)
-
-    def __call__(self, action: Array) -> Array:
-        """Returns an action of the box, from numbers in one row."""
-        scaled = (self.middle + self.reach * action).clip(self.low, self.high)
-        return scaled.astype(self.box.dtype).reshape(self.box.shape)
-
-
-def _options(space: spaces.Space[Any]) -> Array:
+def _options(space: Any) -> list[int]:
     """Returns how many options each choice has."""
-    if isinstance(space, spaces.Discrete):
-        return np.array([space.n])
-    if isinstance(space, spaces.MultiDiscrete):
-        return space.nvec.ravel()
-    return np.full(int(np.prod(space.shape or ())), 2)
+    if isinstance(space, spaces.MultiBinary):
+        return [2] * math.prod(space.shape)
+    counts: list[int] = np.ravel(getattr(space, "nvec", getattr(space, "n", 0))).tolist()
+    return counts
 
 
-def _chosen(space: spaces.Space[Any], choices: Array) -> Any:
-    """Returns what choices counted from 0 are in a space."""
-    if isinstance(space, spaces.Discrete):
-        return int(choices[0] + space.start)
-    shaped = choices.reshape(space.shape)
-    start = space.start if isinstance(space, spaces.MultiDiscrete) else 0
-    return (shaped + start).astype(space.dtype)
+def _of_three_axes(image: Tensor, box: spaces.Box) -> Tensor:
+    """Returns images [*B, ...] with one axis of channels."""
+    if len(box.shape) == 2:
+        return image.unsqueeze(-1)
+    if len(box.shape) == 3:
+        return image
+    if channels_first(box.shape[1:]):
+        return image.flatten(-4, -3)
+    return image.movedim(-4, -2).flatten(-2)
 
 
 def leaves(whole: Any, name: str = "") -> Iterator[tuple[str, Any]]:

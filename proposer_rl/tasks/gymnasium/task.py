@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
@@ -249,8 +249,7 @@ class GymnasiumTask(Task):
                 "transforms: these are not applied to observations of a plain environment; put "
                 "run.solver().actor() into a TransformedEnv with them"
             )
-        make = replace(self._make, as_it_is=True)
-        env = LevelPlayer(make, self._parameters, plays(self.evaluated_on["target"][:1])[0])
+        env = LevelPlayer(self._make, self._parameters, plays(self.evaluated_on["target"][:1])[0])
         env.close()
         return env.observation_space, env.action_space
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from proposer_rl.tasks.gymnasium.answers import ROUNDING, SuccessSettings, UnfitEnvironmentError
-from proposer_rl.tasks.gymnasium.attributes import read_attribute
+from proposer_rl.tasks.gymnasium.answers import SuccessSettings
 from proposer_rl.tasks.gymnasium.pictures import Camera
 from proposer_rl.tasks.gymnasium.player import (
     LevelPlayer,
@@ -21,7 +21,7 @@ from proposer_rl.tasks.gymnasium.player import (
     Play,
     wrapper_error,
 )
-from proposer_rl.tasks.gymnasium.spaces import leaves
+from proposer_rl.tasks.gymnasium.spaces import PartTaken, assembled, leaves
 from proposer_rl.tasks.parameters import Bins
 
 SHORT = 64  # steps of an episode in which levels are compared
@@ -50,13 +50,12 @@ def tried(
         ImportError, gymnasium.error.Error: of the environment, if it cannot be made.
     """
     _check_places(parameters)
-    _check_interface(LevelPlayer(replace(make, as_it_is=True), parameters, target))
+    _check_interface(LevelPlayer(make, parameters, target))
     _check_wrappers(make, parameters, target)
     player = LevelPlayer(make, parameters, target, success)
     limit = make.limit(player)
     if not limit:
         raise ValueError("max_steps: missing: the environment has no time limit of its own")
-    _check_kinds(player, bins)
     _check_episode(player, success, limit)
     for name, part in bins.items():
         some = part.ends if parameters[name].to is None else part.low.tolist()
@@ -102,7 +101,7 @@ def _check_wrappers(
 ) -> None:
     """Refuses a wrapper after which a level does not play alike twice, though it did before."""
     for count in range(len(make.wrappers) + 1 if make.wrappers else 0):
-        some = replace(make, wrappers=make.wrappers[:count], as_it_is=True)
+        some = replace(make, wrappers=make.wrappers[:count])
         player = LevelPlayer(some, parameters, play)
         first, second = (list(_played(player, SHORT)) for _ in range(2))
         player.close()
@@ -122,46 +121,13 @@ def _check_wrappers(
 def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) -> None:
     """Plays one episode to its end, which must tell whether it was a success."""
     steps = list(_played(player, limit + 1))
-    *_, last = steps
-    with np.errstate(over="ignore"):
-        if not all(np.isfinite(part.astype(np.float32)).all() for s in steps for part in s.seen):
-            raise UnfitEnvironmentError(
-                f"it shows NaN or infinity, or a number beyond float32, on the level {player.play}"
-            )
-    if success.kind == "survived" and last.truncated and player.in_time:
+    if success.kind == "survived" and steps[-1].truncated and player.in_time:
         warnings.warn(
             f"success.kind=survived: the environment cut an episode off after {len(steps)} steps, "
             f"before the time limit of {limit}, which is no survival; if that is its own time "
             "limit, set max_steps to it",
             stacklevel=2,
         )
-    rewards = {step.reward for step in steps}
-    most = max(rewards) * limit
-    if (
-        success.least is not None
-        and len(rewards) == 1
-        and 0 < most * (1 + ROUNDING) < success.least
-    ):
-        warnings.warn(
-            f"success.least={success.least:g}: can it be reached? Each step of an episode had a "
-            f"reward of {most / limit:g}, and there are {limit} steps at most",
-            stacklevel=2,
-        )
-
-
-def _check_kinds(player: LevelPlayer, bins: Mapping[str, Bins]) -> None:
-    """Warns of fractions in the place of whole numbers, before there has been a reset."""
-    for name, given in player.parameters.items():
-        if given.set != "attribute" or given.to or not bins[name].low.is_floating_point():
-            continue
-        for path in given.names(name):
-            before = read_attribute(player.unwrapped, path)
-            if isinstance(before, int) and not isinstance(before, bool):
-                warnings.warn(
-                    f"parameters.{name}: {path} is a whole number, {before}, and gets fractions; "
-                    "where it counts something, give values: [...] of whole numbers",
-                    stacklevel=2,
-                )
 
 
 def _check_values(player: LevelPlayer, name: str, plays: list[Play]) -> None:
@@ -226,18 +192,20 @@ def _played(player: LevelPlayer, steps: int) -> Iterator[_Played]:
     player.action_space.seed(0)
     player.reset()
     for _ in range(steps):
-        seen, reward, terminated, truncated, _ = player.step(_action(player.action_space, numbers))
+        parts = (_drawn(part, numbers) for _, part in leaves(player.action_space))
+        action = assembled(player.action_space, parts)
+        seen, reward, terminated, truncated, _ = player.step(action)
         yield _Played([np.array(part) for _, part in leaves(seen)], reward, terminated, truncated)
         if terminated or truncated:
             return
 
 
-def _action(space: spaces.Space[Any], numbers: np.random.Generator) -> Any:
+def _drawn(part: Any, numbers: np.random.Generator) -> Any:
     """Returns an action as a new policy draws it, which for a box is a normal one."""
-    if not isinstance(space, spaces.Box):
-        return space.sample()
-    drawn = numbers.normal(size=space.shape).clip(space.low, space.high)
-    return drawn.astype(space.dtype)
+    if not isinstance(part, spaces.Box):
+        return part.sample()
+    taken = PartTaken(part)
+    return taken(torch.from_numpy(numbers.normal(size=taken.size))).numpy()
 
 
 def _same_episodes(one: list[_Played], other: list[_Played]) -> bool:

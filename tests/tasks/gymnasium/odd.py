@@ -129,7 +129,6 @@ class Robot(Line):
     )
 
     def step(self, action: Any) -> Any:
-        self.taken = action
         return super().step(int(action[0][0] > 1))
 
 

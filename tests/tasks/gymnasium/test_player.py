@@ -164,19 +164,6 @@ def test_a_longer_pole_obeys_the_equations_of_motion() -> None:
     assert seen[3] == pytest.approx(turn + 0.02 * turning, abs=1e-5)
 
 
-def test_continuous_actions_go_from_minus_one_to_one() -> None:
-    parameters = {"g": ParameterSettings(values=[10.0], target=10.0)}
-    make, play = MakeEnvironment("Pendulum-v1"), Play({"g": 10.0}, 4)
-    player = LevelPlayer(make, parameters, play)
-    for action, torque in ((0.5, 1.0), (-1.0, -2.0), (3.0, 2.0)):
-        plain = gymnasium.make("Pendulum-v1", g=10.0)
-        plain.reset(seed=4)
-        player.reset()
-        ours = player.step(np.array([action], np.float32))
-        theirs = plain.step(np.array([torque], np.float32))
-        assert ours[0] == pytest.approx(theirs[0]) and ours[1] == pytest.approx(theirs[1])
-
-
 REFUSED = [
     (numbers("lenght"), 1,
      "parameters.lenght: Walk has no attribute 'lenght'; numbers that it has: width, wind"),
