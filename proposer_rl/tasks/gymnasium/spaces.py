@@ -148,18 +148,17 @@ class PartTaken:
         return own.to(self._dtype)
 
 
-def typed(space: spaces.Space[Any], seen: Any) -> Any:
+def typed(space: Any, seen: Any) -> Any:
     """Returns an observation whose numbers have the types of its space, in its order.
 
     Raises:
         UnfitEnvironmentError: where a part has another shape, or would become another number. A
             float beyond its bounds does not: nothing here depends on them.
     """
-    parts = zip(leaves(space), in_order(space, seen), strict=True)
-    return assembled(space, (_typed(part, one) for (_, part), one in parts))
-
-
-def _typed(space: Any, seen: Any) -> Any:
+    if isinstance(space, spaces.Dict):
+        return {name: typed(part, seen[name]) for name, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(typed(part, one) for part, one in zip(space.spaces, seen, strict=True))
     if not isinstance(space, NUMERIC):
         return seen
     array = np.asarray(seen)
