@@ -20,7 +20,7 @@ from pydantic import BaseModel, FiniteFloat, TypeAdapter, ValidationError
 from proposer_rl.runs.folder import is_rate, read_bounded
 
 LARGEST = 1e100  # what is greater is no measurement, and overflows when it is drawn
-LONGEST_TEXT, LONGEST_NAME = 400, 80  # of what is shown in a line
+LONGEST_TEXT = 400  # characters of what is shown in a line
 
 # Total gains of replicas, by their name in the records of cycles; the first that is there is shown.
 GAINS = {"log_success_gain": "log success", "return_gain": "return"}
@@ -105,11 +105,6 @@ def small_json(path: Path, largest: int = 2**20) -> Any:
 def printable(text: str) -> str:
     """Returns a text as one line without control characters."""
     return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
-
-
-def shortened(text: str, longest: int) -> str:
-    """Returns a text as it is, or where it is longer its beginning and dots."""
-    return text if len(text) <= longest else f"{text[: longest - 3]}..."
 
 
 def encoded(text: str) -> bytes:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -28,13 +29,7 @@ from proposer_rl.learning import (
     mean_performance,
 )
 from proposer_rl.models import ActorCritic, Population, distribution_of, memory_actor_critic, normal
-from proposer_rl.runs.records import (
-    LONGEST_NAME,
-    LONGEST_TEXT,
-    png,
-    shortened,
-    written,
-)
+from proposer_rl.runs.records import LONGEST_TEXT, png, written
 from proposer_rl.streams import Streams
 from proposer_rl.task.protocols import (
     ComputeContext,
@@ -384,11 +379,14 @@ class Task(ABC):
         - ``samples``: records (see :meth:`record`) of levels of each distribution measured on.
         """
         return {
-            "title": shortened(self.title, LONGEST_NAME),
+            "title": self.title,
             "levels": self.noun,
             "distributions": list(self.evaluated_on),
             "space": {name: list(values) for name, values in self.space.axes.items()},
-            "about": {key: shortened(said, LONGEST_TEXT) for key, said in self.about.items()},
+            "about": {
+                key: shorten(said, LONGEST_TEXT, placeholder=" ...")
+                for key, said in self.about.items()
+            },
             "key": self.key,
             **({"text_key": self.text_key} if self.text_key else {}),
             "measured": self._measured,

@@ -327,16 +327,6 @@ def test_a_restored_snapshot_trains_on_bit_for_bit() -> None:
     assert not (ends[0][0] == snapshot).all()
 
 
-def test_a_copy_can_be_forked() -> None:
-    ppo, many = learner(copies=2), learner(copies=3)
-    ppo.update(generators(0, 1))
-    many.restore(ppo.snapshot()[[1] * 3])
-    for name, entry in ppo.snapshot().items():
-        for key in ("value", "exp_avg", "exp_avg_sq", "step"):
-            for copied in many.snapshot()[name][key]:
-                assert torch.equal(copied, entry[key][1])
-
-
 @st.composite
 def choices_of_copies(draw: st.DrawFn) -> list[int]:
     """Which of K copies stands in each of the K places afterwards."""
@@ -438,25 +428,6 @@ def test_more_updates_on_one_batch_recompute_values_and_advantages() -> None:
     torch.testing.assert_close(
         second["advantage"], hand_gae(second, 0.99, 0.95), rtol=1e-4, atol=1e-5
     )
-
-
-def test_one_pass_per_level_trains_as_one_pass_per_transition() -> None:
-    """Four updates: the same actions throughout, and the same weights up to rounding."""
-    by_level, by_step = learner(2), learner(2, per_step=True)
-    assert by_level.agent.encoder is not None and by_step.agent.encoder is None
-    start = [parameter.detach().clone() for parameter in by_level.agent.parameters()]
-    for one, other in zip(train(by_level, 4), train(by_step, 4), strict=True):
-        assert torch.equal(one["rollout", "action"], other["rollout", "action"])
-        for key, value in one["metrics"].items():
-            torch.testing.assert_close(value, other["metrics", key], rtol=1e-3, atol=1e-4)
-    ends = (by_level.agent.parameters(), by_step.agent.parameters())
-    for one, other in zip(*ends, strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)
-    moved = max(
-        float((end.detach() - begin).abs().max())
-        for end, begin in zip(by_level.agent.parameters(), start, strict=True)
-    )
-    assert moved > 2e-3
 
 
 @pytest.mark.parametrize("copies", [1, 2])

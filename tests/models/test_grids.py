@@ -71,14 +71,6 @@ def test_maps_have_the_resolution_of_the_input(height: int, width: int) -> None:
     assert value.shape == (2, 1, height, width)
 
 
-def test_leading_dimensions_are_a_batch() -> None:
-    network = UNet(channels=(8, 16, 16), groups=4)
-    planes = torch.rand(2, 3, 3, 6, 6)
-    policy, _ = network(planes)
-    single, _ = network(planes[1, 2])
-    torch.testing.assert_close(policy[1, 2], single)
-
-
 def test_parameters_of_the_papers_network() -> None:
     def double(fan_in: int, out: int) -> int:
         return 9 * fan_in * out + 9 * out * out + 2 * out + 4 * out  # weights, biases, norms

@@ -126,21 +126,6 @@ def test_an_episode_knows_nothing_of_the_one_before() -> None:
     assert not torch.equal(one[:, :, 4], another[:, :, 4])
 
 
-def test_each_copy_remembers_by_itself() -> None:
-    actor_critic, batch = agent(), steps()
-    together = through_time(actor_critic, batch)
-    torch.manual_seed(0)
-    for k in range(K):
-        alone = memory_actor_critic(Population(network, 1), ["x"], M)
-        with torch.no_grad():
-            one = through_time(alone, batch[k : k + 1])
-        torch.testing.assert_close(together["logits"][k], one["logits"][0])
-    together["logits"][0].sum().backward()
-    for parameter in actor_critic.parameters():
-        if parameter.grad is not None:
-            assert not parameter.grad[1:].any()
-
-
 def test_memory_begins_at_zero() -> None:
     memory = agent().no_memory(steps()[:, :, 0])
     assert list(memory.keys()) == list(MEMORY) and memory.batch_size == (K, N)

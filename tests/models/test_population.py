@@ -163,17 +163,6 @@ def test_a_parameter_that_is_not_used_has_no_slope() -> None:
     }
 
 
-def test_one_copy_does_not_see_another() -> None:
-    population = together(2)
-    planes = torch.rand(2, 3, 3, 6, 6)
-    before, _ = population(planes)
-    changed = planes.clone()
-    changed[1] += 1
-    after, _ = population(changed)
-    assert torch.equal(before[0], after[0])
-    assert not torch.equal(before[1], after[1])
-
-
 def test_bf16_returns_float32_near_the_fp32_values() -> None:
     planes = torch.rand(2, 3, 3, 10, 10)
     exact, _ = together(2)(planes)
@@ -181,10 +170,6 @@ def test_bf16_returns_float32_near_the_fp32_values() -> None:
     assert rounded.dtype == torch.float32
     assert not torch.equal(rounded, exact)
     torch.testing.assert_close(rounded, exact, rtol=0.1, atol=0.1)
-
-
-def test_a_network_with_one_output_gives_one_output() -> None:
-    assert Population(lambda: nn.Linear(4, 2), 3)(torch.rand(3, 5, 4)).shape == (3, 5, 2)
 
 
 def test_buffers_which_replicas_would_share_are_refused() -> None:

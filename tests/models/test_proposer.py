@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import pytest
 import torch
 from scipy import stats
 from tensordict import TensorDict
@@ -17,7 +16,6 @@ from proposer_rl.models import (
     normal,
     proposer_actor_critic,
 )
-from proposer_rl.models.proposer import fourier_encoding
 
 
 def maps(features: int) -> MapEncoder:
@@ -29,18 +27,6 @@ def network(**options) -> ProposerNetwork:
     numbers = options.get("numbers", 0)
     head = ProblemHead(16 + numbers, problems=6, choices=5, hidden=16)
     return ProposerNetwork(head, maps(16), context=16, hidden=16, **options)
-
-
-def test_shapes() -> None:
-    logits, value = network()(torch.rand(2, 3, 4, 7, 10, 10))
-    assert logits.shape == (2, 3, 6, 5)
-    assert value.shape == (2, 3, 1)
-
-
-def test_the_probes_are_a_set() -> None:
-    probes = torch.rand(2, 4, 7, 10, 10)
-    for one, other in zip(network()(probes), network()(probes.flip(1)), strict=True):
-        torch.testing.assert_close(one, other)
 
 
 def test_probes_may_be_vectors() -> None:
@@ -62,11 +48,6 @@ def test_an_encoder_of_maps_reads_each_by_itself() -> None:
     torch.testing.assert_close(features[1, 2], encoder(probes[1:, 2:])[0, 0])
 
 
-def test_an_encoder_of_maps_has_a_convolution() -> None:
-    with pytest.raises(ValueError, match=r"channels must have at least 1 item, got \[\]"):
-        MapEncoder(7, [], 5)
-
-
 def test_without_probes_every_state_looks_alike() -> None:
     logits, value = network()(torch.rand(3, 0, 7, 10, 10))
     assert logits.shape == (3, 6, 5)
@@ -77,14 +58,6 @@ def test_the_first_policy_is_nearly_uniform_but_not_the_same_for_all_problems() 
     logits, _ = network()(torch.rand(1, 4, 7, 10, 10))
     assert (logits.softmax(-1) - 1 / 5).abs().max() < 0.02
     assert logits.std(-2).max() > 0
-
-
-@pytest.mark.parametrize("problems", [1, 2, 16, 128])
-def test_problem_encodings_are_distinct(problems: int) -> None:
-    encoding = fourier_encoding(problems, 16)
-    assert encoding.shape == (problems, 32)
-    distances = torch.cdist(encoding, encoding) + 10 * torch.eye(problems)
-    assert distances.min() > 0.1
 
 
 def test_ratios_differ_in_what_is_one_event() -> None:

@@ -8,13 +8,13 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from proposer_rl.runs.folder import read_bounded, write_atomically
+from proposer_rl.runs.folder import read_bounded
 from proposer_rl.settings import arguments, settings
 from proposer_rl.tasks.mazes import Level, shortest_path_length
 from proposer_rl.tasks.mazes.rendering import recorded_drawing
 
 SUFFIXES = (".txt", ".json")
-RECORD = ".jsonl"  # of levels that a run trained on; read, not written
+RECORD = ".jsonl"  # of levels that a run trained on
 LARGEST_FILE_BYTES = 10**7  # bytes; files may come from anybody
 LONGEST_NAME = 80
 
@@ -62,23 +62,6 @@ def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict
         return levels_from_text(text, path.stem, kind)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-
-
-def write_levels(path: str | os.PathLike[str], levels: Mapping[str, Level]) -> None:
-    """Writes a file of levels; one that exists is replaced.
-
-    Args:
-        path: As in :func:`read_levels`.
-        levels: Levels of batch shape ``[]`` by their names.
-
-    Raises:
-        ValueError: If the name of the file or of a level cannot be used, or a goal is out of reach.
-        StorageError: If the disk cannot take it.
-    """
-    path = Path(path)
-    check_suffix(path, SUFFIXES)
-    text = levels_to_json(levels) if path.suffix == ".json" else levels_to_text(levels)
-    write_atomically(path, text.encode())
 
 
 def shipped_sets() -> list[str]:
@@ -183,20 +166,15 @@ def levels_from_record(text: str, kind: type[Level] = Level) -> dict[str, Level]
 
 
 def levels_to_text(levels: Mapping[str, Level]) -> str:
-    """Draws levels; the inverse of :func:`levels_from_text`, with their path lengths."""
+    """Draws levels; the inverse of :func:`levels_from_text`, with their path lengths.
+
+    Raises:
+        ValueError: If the name of a level cannot be used, or a goal is out of reach.
+    """
     return "\n".join(
-        f"[{name}]\npath_length: {length}\n{level.to_text()}\n"
-        for name, level, length in _with_lengths(levels)
+        f"[{name}]\npath_length: {_check_length(name, level)}\n{level.to_text()}\n"
+        for name, level in levels.items()
     )
-
-
-def levels_to_json(levels: Mapping[str, Level]) -> str:
-    """Writes levels as JSON; the inverse of :func:`levels_from_json`, with their path lengths."""
-    items = [
-        {"name": name, "path_length": length, "level": level.to_text().splitlines()}
-        for name, level, length in _with_lengths(levels)
-    ]
-    return json.dumps({"levels": items}, indent=1) + "\n"
 
 
 def named_levels(
@@ -220,10 +198,6 @@ def named_levels(
     if not levels:
         raise ValueError("holds no levels")
     return levels
-
-
-def _with_lengths(levels: Mapping[str, Level]) -> list[tuple[str, Level, int]]:
-    return [(name, level, _check_length(name, level)) for name, level in levels.items()]
 
 
 def _check_length(name: str, level: Level, recorded: int | None = None) -> int:

@@ -14,7 +14,7 @@ from torchrl.envs.utils import check_env_specs
 from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.answers import Step, SuccessSettings
-from proposer_rl.tasks.gymnasium.batched_env import GymnasiumEnv, LostProcessError, plays
+from proposer_rl.tasks.gymnasium.batched_env import GymnasiumEnv, LostProcessError
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
 from proposer_rl.tasks.parameters import ParameterSpace
 from tests.tasks.gymnasium.odd import odd
@@ -101,13 +101,6 @@ def test_levels_are_taken_up_at_the_next_reset() -> None:
     env.set_levels(LEVELS)
     torch.testing.assert_close(env.reset()["observation"], make().reset()["observation"])
     assert not torch.equal(after[:, :, 0], env.reset()["observation"])
-
-
-def test_a_level_becomes_what_a_player_plays() -> None:
-    (play,) = plays(LEVELS[1, 2:])
-    assert play.seed == LEVELS[1, 2]["seed"]
-    assert play.values == {name: LEVELS[1, 2][name].item() for name in PARAMETERS}
-    assert isinstance(play.values["begin"], int)
 
 
 STEPS = [  # ended by the environment, by the time limit, by both, cut off before

@@ -138,11 +138,6 @@ def test_what_the_environment_needs_can_be_put_around_it() -> None:
     assert task.learner([Streams(0)]).env.observation_spec["observation"].shape == (1, 4, 2)
 
 
-def test_the_target_lies_where_the_settings_say() -> None:
-    shares = walk_task().target_shares.reshape(2, 2, 2, 2)
-    assert shares[1, 1, :, 1].tolist() == [0.5, 0.5]
-
-
 def test_statistics_and_returns_are_those_of_the_environment() -> None:
     task = walk_task()
     learner = task.learner([Streams(0)])
@@ -295,14 +290,13 @@ def test_one_parameter_can_set_several_numbers() -> None:
 def test_many_parameters_and_values_are_described_in_short() -> None:
     one = ParameterSettings(set="option", low=0.125, high=0.375, target=[0.1875, 0.3125])
     many = ParameterSettings(set="option", values=list(range(200)), target=list(range(150)))
-    gymnasium.register(name := f"{'Long' * 30}-v0", Line, max_episode_steps=6)
     task = walk_task(
-        env_id=name, parameters={f"number {i}": one for i in range(17)} | {"track": many}
+        env_id=odd(), parameters={f"number {i}": one for i in range(17)} | {"track": many}
     )
     told = checked(TaskFacts, task.facts, "task")
     assert len(told.space) == 18 and len(told.space["track"]) == 200
     assert told.about["Target"].startswith("number 0 0.1875 to 0.3125; number 1 0.1875 to")
-    assert told.about["Target"].endswith("...") and told.title == f"{'Long' * 20}"[:77] + "..."
+    assert told.about["Target"].endswith("...") and len(told.about["Target"]) <= 400
 
 
 def test_what_values_stand_for_is_tried_and_distinguishes_measurements() -> None:

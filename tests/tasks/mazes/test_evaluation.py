@@ -5,7 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import binom, norm
+from scipy.stats import norm
 from torch import Tensor
 
 from proposer_rl.tasks.mazes import Level, generate_levels
@@ -18,7 +18,7 @@ from proposer_rl.tasks.mazes.evaluation import (
     success_from_cells,
     worst_mean,
 )
-from tests.tasks.mazes.oracles import distances, moved, play, random_levels
+from tests.tasks.mazes.oracles import moved, play, random_levels
 
 UP, DOWN, LEFT, RIGHT = range(4)
 
@@ -31,26 +31,31 @@ def constant_logits(probabilities: list[float], height: int, width: int) -> Tens
     return torch.tensor(probabilities).log().view(4, 1, 1).expand(4, height, width)
 
 
+def chain(level: Level, policy: torch.Tensor) -> np.ndarray:
+    """Probability of moving from cell to cell, [H*W, H*W]; the goal absorbs."""
+    height, width = level.walls.shape
+    matrix = np.zeros((height * width, height * width))
+    for row, column in np.ndindex(height, width):
+        for action in range(4):
+            there = moved(level, (row, column), action)
+            there = (row, column) if level.goal.tolist() == [row, column] else there
+            chance = float(policy[action, row, column])
+            matrix[row * width + column, there[0] * width + there[1]] += chance
+    return matrix
+
+
 def by_dense_matrix(
     level: Level, policy: Tensor, max_steps: int, step_penalty: float
 ) -> tuple[float, float]:
     """Return and success by repeated multiplication with the chain's whole matrix, in float64."""
-    height, width = level.walls.shape
-    goal = level.goal[0] * width + level.goal[1]
-    matrix = torch.zeros(height * width, height * width, dtype=torch.float64)
-    for cell in range(height * width):
-        for action in range(4):
-            row, column = moved(level, divmod(cell, width), action)
-            matrix[cell, row * width + column] += policy[action].flatten()[cell].double()
-    matrix[goal] = 0
-    matrix[goal, goal] = 1
-    state = torch.zeros(height * width, dtype=torch.float64)
-    state[level.start[0] * width + level.start[1]] = 1
-    total = 0.0
+    width = level.walls.shape[1]
+    matrix = chain(level, policy)
+    start, goal = (int(cell[0] * width + cell[1]) for cell in (level.start, level.goal))
+    state, total = np.eye(len(matrix))[start], 0.0
     for _ in range(max_steps):
         before, state = state, state @ matrix
-        total += (state[goal] - before[goal] - step_penalty * (1 - before[goal])).item()
-    return total, state[goal].item()
+        total += state[goal] - before[goal] - step_penalty * (1 - before[goal])
+    return total, state[goal]
 
 
 @settings(max_examples=30)
@@ -79,19 +84,6 @@ def test_exact_values_agree_with_the_dense_chain(
         assert found == pytest.approx(expected, abs=2e-5)
 
 
-@pytest.mark.parametrize("length", [1, 4, 9])
-def test_corridor_has_a_closed_form(length: int) -> None:
-    """Right with probability p, else up, which does not move: a negative binomial waiting time."""
-    p, limit, penalty = 0.6, 12, 0.03
-    level = Level.from_text("." * 2 + "S" + "." * (length - 1) + "G" + "...")
-    logits = constant_logits([1 - p, 1e-30, 1e-30, p], 1, level.walls.shape[1])
-    result = ExactEvaluator(limit, penalty)(level, logits)
-    arrived = [1 - binom.cdf(length - 1, steps, p) for steps in range(limit + 1)]
-    assert result["success"].item() == pytest.approx(arrived[limit], abs=1e-6)
-    steps = sum(1 - arrived[step] for step in range(limit))
-    assert result["return"].item() == pytest.approx(arrived[limit] - penalty * steps, abs=1e-6)
-
-
 def test_exact_agrees_with_episodes_of_the_environment() -> None:
     levels = generate_levels([0.2] * 12, 3, 5, 5, generator=torch.Generator().manual_seed(0))
     logits = random_logits(12, 4, 5, 5, scale=0.5)
@@ -108,26 +100,6 @@ def test_exact_agrees_with_episodes_of_the_environment() -> None:
     assert ((played["return"] - exact["return"]).abs() < bound * error).all()
 
 
-def test_rollout_means_are_over_first_episodes_only() -> None:
-    """A policy that walks straight to the goal earns one success, though the horizon goes on."""
-    levels = Level.from_text(["S.G", "SG."])
-    logits = constant_logits([1e-30, 1e-30, 1e-30, 1.0], 1, 3).expand(2, 4, 1, 3)
-    result = RolloutEvaluator(10, 0.125, episodes=3)(levels, logits)
-    assert result["success"].tolist() == [1.0, 1.0] and result["return"].tolist() == [0.75, 0.875]
-
-
-def test_generator_determines_the_rollouts() -> None:
-    levels, logits = random_levels(20, 4, 4, 0.2, 0), random_logits(20, 4, 4, 4)
-
-    def success(seed: int) -> Tensor:
-        torch.rand(seed)  # the global state does not matter
-        generator = torch.Generator().manual_seed(seed)
-        return RolloutEvaluator(episodes=3)(levels, logits, generator)["success"]
-
-    assert torch.equal(success(1), success(1))
-    assert not torch.equal(success(1), success(2))
-
-
 def test_copies_play_with_the_same_numbers_in_any_company() -> None:
     levels, logits = random_levels(12, 4, 4, 0.2, 0), random_logits(3, 12, 4, 4, 4)
 
@@ -138,19 +110,6 @@ def test_copies_play_with_the_same_numbers_in_any_company() -> None:
     together = returns(slice(3))
     assert torch.equal(returns(slice(1, 3)), together[1:])
     assert not torch.equal(together[0], together[1])
-
-
-@settings(max_examples=30)
-@given(seed=st.integers(0, 10_000), greedy=st.booleans())
-def test_success_is_a_probability_that_grows_with_the_step_limit(seed: int, greedy: bool) -> None:
-    levels = random_levels(8, 5, 5, 0.3, seed)
-    logits = random_logits(8, 4, 5, 5, seed=seed)
-    limits = [0, 1, 2, 5, 10, 25, 60]
-    success = torch.stack(
-        [ExactEvaluator(limit, greedy=greedy)(levels, logits)["success"] for limit in limits]
-    )
-    assert (success[0] == 0).all() and (success <= 1 + 1e-6).all()
-    assert (success.diff(dim=0) >= -1e-6).all()
 
 
 @settings(max_examples=20)
@@ -224,37 +183,12 @@ def test_the_optimum_is_what_the_best_sequence_of_actions_gets(
     assert found.flatten().tolist() == pytest.approx(expected, abs=1e-5)
 
 
-def shortest_path_logits(level: Level) -> Tensor:
-    """A policy that goes to a neighbour which is nearer to the goal: float [4, H, W]."""
-    logits = torch.zeros(4, *level.walls.shape)
-    away = distances(Level(level.walls, level.goal, level.start, batch_size=[]))
-    for cell, distance in away.items():
-        for action in range(4):
-            if away[moved(level, cell, action)] < distance:
-                logits[(action, *cell)] = 1.0
-    return logits
-
-
 @pytest.mark.parametrize(("moves", "expected"), [(25, 1 - 25 * 0.01), (26, -25 * 0.01)])
 def test_by_default_an_episode_has_the_papers_25_moves(moves: int, expected: float) -> None:
     corridor = Level.from_text(f"S{'.' * (moves - 1)}G")
-    reached = ExactEvaluator(greedy=True)(corridor, shortest_path_logits(corridor))["return"]
-    assert reached.item() == pytest.approx(expected, abs=1e-5)
+    ahead = constant_logits([1e-30, 1e-30, 1e-30, 1.0], 1, moves + 1)
+    assert ExactEvaluator()(corridor, ahead)["return"].item() == pytest.approx(expected, abs=1e-5)
     assert optimal_return(corridor).item() == pytest.approx(expected, abs=1e-5)
-
-
-@settings(max_examples=30)
-@given(max_steps=st.integers(1, 15), seed=st.integers(0, 10_000))
-def test_the_optimum_is_reached_on_a_shortest_path_and_passed_by_no_policy(
-    max_steps: int, seed: int
-) -> None:
-    levels = random_levels(6, 4, 5, 0.3, seed)
-    optimum = optimal_return(levels, max_steps, 0.02)
-    shortest = torch.stack([shortest_path_logits(level) for level in levels])
-    reached = ExactEvaluator(max_steps, 0.02, greedy=True)(levels, shortest)["return"]
-    torch.testing.assert_close(reached, optimum, rtol=0, atol=1e-5)
-    some = ExactEvaluator(max_steps, 0.02)(levels, random_logits(6, 4, 4, 5, seed=seed, scale=3.0))
-    assert (some["return"] <= optimum + 1e-5).all()
 
 
 @given(
@@ -281,14 +215,6 @@ def test_gradients_agree_with_finite_differences() -> None:
     assert torch.autograd.gradcheck(evaluate, logits, eps=1e-6, atol=1e-8, rtol=1e-6)
 
 
-def test_logits_of_half_precision_are_evaluated_in_single() -> None:
-    levels, logits = random_levels(6, 4, 5, 0.3, 0), random_logits(6, 4, 4, 5, scale=3.0)
-    rounded = logits.to(torch.bfloat16)
-    found = ExactEvaluator()(levels, rounded)["return"]
-    expected = ExactEvaluator()(levels, rounded.float())["return"]
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
-
-
 def test_double_precision_is_kept() -> None:
     levels, logits = random_levels(2, 3, 3, 0.2, 3), random_logits(2, 4, 3, 3).double()
     result = ExactEvaluator(max_steps=8, step_penalty=0.05)(levels, logits)
@@ -310,19 +236,6 @@ def test_results_are_as_precise_as_the_logits(greedy: bool) -> None:
 STEPS = 9
 
 
-def chain(level: Level, policy: torch.Tensor) -> np.ndarray:
-    """Probability of moving from cell to cell, [H*W, H*W]; the goal absorbs."""
-    height, width = level.walls.shape
-    matrix = np.zeros((height * width, height * width))
-    for row, column in np.ndindex(height, width):
-        for action in range(4):
-            there = moved(level, (row, column), action)
-            there = (row, column) if level.goal.tolist() == [row, column] else there
-            chance = float(policy[action, row, column])
-            matrix[row * width + column, there[0] * width + there[1]] += chance
-    return matrix
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_they_are_those_of_the_markov_chain(seed: int) -> None:
     level = random_levels(1, 4, 5, 0.3, seed)[0]
@@ -338,13 +251,3 @@ def test_they_are_those_of_the_markov_chain(seed: int) -> None:
     visits[goal] = 0  # no step begins there
     found = expected_visits(level, policy, STEPS).numpy()
     np.testing.assert_allclose(found.ravel(), visits, atol=1e-5)
-
-
-def test_the_evaluator_tells_the_same_of_the_start() -> None:
-    for level in random_levels(5, 5, 5, 0.3, 1):
-        logits = torch.randn(4, 5, 5)
-        result = ExactEvaluator(STEPS, 0.5)(level, logits)
-        success = success_from_cells(level, logits.softmax(0), STEPS)[tuple(level.start.tolist())]
-        steps = expected_visits(level, logits.softmax(0), STEPS).sum()
-        torch.testing.assert_close(success, result["success"])
-        torch.testing.assert_close(success - 0.5 * steps, result["return"])

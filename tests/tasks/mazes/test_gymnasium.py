@@ -156,19 +156,13 @@ def test_gymnasium_makes_a_vector_of_them() -> None:
     ("arguments", "message"),
     [
         ({"obstacle_fraction": 1.5}, "obstacle_fraction=1.5: input should be less than 1"),
-        ({"obstacle_fraction": []}, r"obstacle_fraction=\[\]: input should be"),
-        ({"step_penalty": "x"}, "step_penalty='x': input should be a valid number"),
-        ({"observe_agent": 2}, "observe_agent=2: input should be a valid boolean"),
         ({"path_length": 2.5}, "path_length=2.5: input should be a valid integer"),
         ({"path_length": 30}, "max_steps=25: must be at least the path length 30"),
         ({"height": 2, "width": 2, "path_length": 5}, "cannot make levels with"),
-        ({"max_steps": True}, "max_steps=True: input should be a valid integer"),
         ({"mechanism": "maze"}, "mechanism='maze': input should be 'uniform' or 'path_first'"),
-        ({"render_mode": "gif"}, "render_mode='gif': input should be 'rgb_array' or 'ansi'"),
         ({"hight": 3}, "hight: unknown; there are: height, width"),
     ],
 )
-@pytest.mark.filterwarnings("ignore:.*render_mode")  # Gymnasium's own remark, before ours
 def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(**arguments)

@@ -9,10 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torch import nn
-from torchrl.envs import check_env_specs
 
-from proposer_rl.models import population
 from proposer_rl.tasks.point_masses.task import PointMassEnv
 
 DOWN, UP, RIGHT = (0.0, -1.0), (0.0, 1.0), (1.0, 0.0)
@@ -152,48 +149,3 @@ def test_success_is_to_be_at_the_goal_in_the_end() -> None:
     by = fly((0.0, 1.0, 0.0), DOWN, steps=100)
     assert not any(bool(state["success"]) for state in by)
     assert any(abs(float(state["observation"][2]) + 3) < 0.25 for state in by)
-
-
-@pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
-def test_torchrl_finds_nothing_wrong(shape: tuple[int, ...]) -> None:
-    level = {name: torch.ones(shape) for name in ("position", "width", "friction")}
-    env = PointMassEnv(TensorDict(level, shape), max_steps=4)
-    check_env_specs(env, break_when_any_done="both")
-
-
-def test_new_levels_begin_with_the_next_reset_of_each() -> None:
-    env = PointMassEnv(gates((0.0, 1.0, 0.0), (0.0, 1.0, 0.0)))
-    state = env.step(env.reset().set("action", torch.zeros(2, 2)))["next"].exclude("reward")
-    env.set_levels(gates((2.0, 3.0, 1.0), (2.0, 3.0, 1.0)))
-    state = env.reset(state.set("_reset", torch.tensor([[False], [True]])))
-    assert state["observation"][:, 4:].tolist() == [[0.0, 1.0, 0.0], [2.0, 3.0, 1.0]]
-    assert state["step_count"].flatten().tolist() == [1, 0]
-
-
-def test_on_a_gpu_finished_episodes_begin_again_without_a_look(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """As TorchRL's own resets, which ask the device first whether there are any."""
-    levels, rollouts = gates((0, 8, 0), (4, 0.5, 1), (-2, 1, 4)), []
-    for at_hand in (True, False):
-        monkeypatch.setattr(population, "at_hand", lambda _, answer=at_hand: answer)
-        env = PointMassEnv(levels, max_steps=15)
-        torch.manual_seed(0)
-        rollouts.append(env.rollout(60, break_when_any_done=False, policy=DownOrAside()))
-    assert rollouts[0]["next", "done"].sum() > 9
-    assert rollouts[0]["next", "terminated"].any()
-    assert (rollouts[0] == rollouts[1]).all()
-
-
-class DownOrAside(nn.Module):
-    """Pushes at random, and mostly towards the wall."""
-
-    def forward(self, tensordict: TensorDict) -> TensorDict:
-        return tensordict.set("action", torch.rand(*tensordict.batch_size, 2) * 2 - 1.6)
-
-
-def test_levels_of_another_shape_are_refused() -> None:
-    env = PointMassEnv(gates((2.0, 3.0, 1.0), (0.0, 3.0, 1.0)))
-    message = r"^levels must keep the environment's batch shape \[2\], got \[1\]$"
-    with pytest.raises(ValueError, match=message):
-        env.set_levels(gates((2.0, 3.0, 1.0)))
