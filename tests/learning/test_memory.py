@@ -7,8 +7,6 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import Unbounded
-from torchrl.envs import ExplorationType, TensorDictPrimer, TransformedEnv, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
 from proposer_rl.learning import PPO, PPOSettings
@@ -100,18 +98,6 @@ def test_a_second_look_at_a_rollout_remembers_with_the_present_weights() -> None
     assert not torch.allclose(steps["state_value"], rollout["state_value"])
     memory = ("next", "recurrent_state_h")
     torch.testing.assert_close(steps[memory], fresh[memory])
-
-
-def test_torchrls_own_rollout_carries_the_memory() -> None:
-    """With its primer in the environment, the agent is an ordinary recurrent policy."""
-    ppo = learner()
-    memory = {key: Unbounded((K, P, n)) for key, n in ppo.agent.memory.items()}
-    env = TransformedEnv(ppo.env, TensorDictPrimer(memory, expand_specs=False))
-    with set_exploration_type(ExplorationType.RANDOM), torch.no_grad():
-        rollout = env.rollout(T, ppo.agent.actor(), break_when_any_done=False)
-    assert rollout["is_init"][:, :, 1:].any() and rollout["recurrent_state_h"].any()
-    again = through_time(ppo, rollout)
-    torch.testing.assert_close(again["logits"], rollout["logits"], rtol=1e-5, atol=1e-6)
 
 
 def test_a_policys_gradient_goes_through_time() -> None:

@@ -36,12 +36,12 @@ from proposer_rl.tasks.gymnasium.spaces import Layout, in_order, typed
 from proposer_rl.tasks.policy import Policy, policy_of
 from tests.processes import ROOT, python
 from tests.tasks.gymnasium.odd import LIMIT, Line, odd
-from tests.tasks.gymnasium.test_normalized_run import NORMALIZED
 from tests.tasks.gymnasium.toys import CHOICES, TINY, walk_task
 from tests.tiny import mountain_cars, point_masses, tiny_task, tiny_view_task
 
 ODD = "tests.tasks.gymnasium.odd:"
 WALK = "tests.tasks.gymnasium.toys:Walk-v0"
+NORMALIZED = ["solver.ppo.normalize_observations=true", "solver.ppo.normalize_rewards=true"]
 
 
 def stacked(first: bool) -> str:

@@ -125,7 +125,8 @@ class SuccessSettings:
         """Returns whether an episode with this last step, or with ``once`` any such, is a success.
 
         Raises:
-            UnfitEnvironmentError: if its info says it in something else than a truth value.
+            UnfitEnvironmentError: if the info says it in something else than a truth value, or that
+                of a last step does not say it, with the entries that there are.
         """
         if self.kind == "return":
             least = self.least or 0.0
@@ -134,25 +135,14 @@ class SuccessSettings:
             return not step.terminated and not step.in_time
         if self.kind == "terminated":
             return step.terminated
-        value = self._entry(step.info)
-        return value is not None and as_flag(
-            value, f"success.key={self.key}: the entry of the info"
-        )
-
-    def check_info(self, info: Mapping[str, Any]) -> None:
-        """Refuses the last info of an episode that does not say whether that was a success.
-
-        Raises:
-            UnfitEnvironmentError: naming the key and the entries that there are.
-        """
-        if self.kind == "info" and not self.optional and self._entry(info) is None:
-            there = ", ".join(name for name, _ in entries(info))
+        value = dict(entries(step.info)).get(self.key or "")
+        if value is not None:
+            return as_flag(value, f"success.key={self.key}: the entry of the info")
+        if not self.optional and (step.terminated or step.truncated):
+            there = ", ".join(name for name, _ in entries(step.info))
             raise UnfitEnvironmentError(
                 f"success.key={self.key}: the last info of an episode has no such entry; it has: "
                 f"{there or 'none'}; where only episodes that succeed have it, set "
                 "success.optional=true"
             )
-
-    def _entry(self, info: Mapping[str, Any]) -> Any:
-        """Returns the info's entry; None where it is absent."""
-        return dict(entries(info)).get(self.key or "")
+        return False

@@ -222,8 +222,6 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             if rule is not None and (over or rule.once):
                 step = Step(terminated, truncated, self.in_time, self._return, self.last_info)
                 self._succeeded = rule(step) or self._succeeded
-            if rule is not None and over:
-                rule.check_info(self.last_info)
         except Exception as error:  # whatever an environment of somebody's may raise
             unfit = isinstance(error, UnfitEnvironmentError)
             said = str(error) if unfit else f"step raises {cause(error)}"

@@ -146,8 +146,9 @@ class GymnasiumTask(Task):
         )
         self.title = env_id
         first = self.evaluated_on["target"][:1]
+        (self._first,) = plays(first)
         with _named(env_id, extra):
-            self.max_steps = tried(self._make, parameters, space.bins, plays(first)[0], success)
+            self.max_steps = tried(self._make, parameters, space.bins, self._first, success)
         self._seen, self._acts = self._specs(first)
         self.observed, self.memory = list(self._seen), network.memory
         # MLPs as small as these are faster all at once.
@@ -255,8 +256,7 @@ class GymnasiumTask(Task):
 
     @cached_property
     def _camera(self) -> Camera:
-        first = plays(self.evaluated_on["target"][:1])[0]
-        return Camera(self._make, self._parameters, first)
+        return Camera(self._make, self._parameters, self._first)
 
     def _unpaid(self) -> list[Transform]:
         return [one for one in self._transforms if "reward" not in one.out_keys]
@@ -292,6 +292,19 @@ class GymnasiumTask(Task):
         return seen, acts
 
 
+OWN_MOMENTS = (
+    "it keeps running statistics, other ones in evaluations: take PPO's normalize_observations and "
+    "normalize_rewards"
+)
+# What would mislead: it trains on something else than what is measured, or never ends an episode.
+MISLEADING: dict[type[Transform], str] = {
+    envs.VecNorm: OWN_MOMENTS,
+    envs.VecNormV2: OWN_MOMENTS,
+    envs.FrameSkipTransform: "it steps on beyond an episode's end: take one of wrappers",
+    envs.StepCounter: "the environment does not see its max_steps: take the task's",
+}
+
+
 def _checked_transforms(transforms: Iterable[Any]) -> Iterator[Transform]:
     """Yields the transforms one by one, also those of a Compose.
 
@@ -299,20 +312,13 @@ def _checked_transforms(transforms: Iterable[Any]) -> Iterator[Transform]:
         ValueError: for what is none, keeps running statistics, or mistakes where episodes end.
     """
     for one in transforms:
-        why = ""
         if isinstance(one, envs.Compose):
             yield from _checked_transforms(part.clone() for part in one.transforms)
             continue
-        if isinstance(one, envs.VecNorm | envs.VecNormV2):
-            why = "it keeps running statistics, other ones in evaluations: take PPO's "
-            why += "normalize_observations and normalize_rewards"
-        elif isinstance(one, envs.FrameSkipTransform):
-            why = "it steps on beyond an episode's end: take one of wrappers"
-        elif isinstance(one, envs.StepCounter) and one.max_steps is not None:
-            why = "the environment does not see its max_steps: take the task's"
-        elif not isinstance(one, Transform):
+        why = next((why for kind, why in MISLEADING.items() if isinstance(one, kind)), "")
+        if not isinstance(one, Transform):
             why = "must be a transform of TorchRL's, as {_target_: torchrl.envs.StepCounter}"
-        if why:
+        if why and getattr(one, "max_steps", True) is not None:  # a StepCounter may only count
             raise ValueError(f"transforms: {type(one).__name__}: {why}")
         yield one
 

@@ -304,21 +304,13 @@ def expected_visits(level: Level, policy: Tensor, max_steps: int) -> Tensor:
         >>> expected_visits(level, torch.full((4, 1, 3), 0.25), max_steps=2)
         tensor([[1.7500, 0.2500, 0.0000]])
     """
-    return _presence(level, policy.flatten(1), max_steps).sum(0).view(level.walls.shape)
-
-
-def _presence(levels: Level, policy: Tensor, max_steps: int) -> Tensor:
-    """Returns the probability that a step begins at every cell, 0 at the goal: [T, *B, H*W].
-
-    Arguments are levels [*B] and action probabilities float [*B, 4, H*W].
-    """
-    width = levels.walls.shape[-1]
-    start, goal = (cell_index(cell, width).unsqueeze(-1) for cell in (levels.start, levels.goal))
-    following = successors(levels).flatten(-2)  # [*B, 4*H*W]
-    here = torch.zeros_like(policy[..., 0, :]).scatter_(-1, start, 1.0)
+    width, chances = level.walls.shape[1], policy.flatten(1)
+    start, goal = (cell_index(cell, width).unsqueeze(-1) for cell in (level.start, level.goal))
+    following = successors(level).flatten()  # [4*H*W]
+    here = torch.zeros_like(chances[0]).scatter_(-1, start, 1.0)
     steps = []
     for _ in range(max_steps):
         steps.append(here)
-        moved = (policy * here.unsqueeze(-2)).flatten(-2)
+        moved = (chances * here).flatten()
         here = torch.zeros_like(here).scatter_add_(-1, following, moved).scatter_(-1, goal, 0.0)
-    return torch.stack(steps)
+    return torch.stack(steps).sum(0).view(level.walls.shape)

@@ -117,8 +117,8 @@ STEPS = [  # ended by the environment, by the time limit, by both, cut off befor
         ({"kind": "terminated"}, [True, False, True, False]),
         ({"kind": "survived"}, [False, True, False, False]),
         ({"kind": "return", "least": 3.0}, [True, True, False, True]),
-        ({"kind": "info", "key": "won"}, [True, False, True, False]),
-        ({"kind": "info", "key": "deep.er"}, [False, False, True, False]),
+        ({"kind": "info", "key": "won", "optional": True}, [True, False, True, False]),
+        ({"kind": "info", "key": "deep.er", "optional": True}, [False, False, True, False]),
     ],
 )
 def test_successes(settings: Any, expected: list[bool]) -> None:

@@ -107,25 +107,3 @@ def test_a_run_is_trained_resumed_and_evaluated(
         assert row["success_low"] <= row["success"] <= row["success_high"]
         assert row["success"] * 5 == round(row["success"] * 5)  # of 5 episodes
         assert row["max_steps"] == 12
-
-
-def test_files_that_hold_no_levels_are_refused(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run(tmp_path / "run", "+method=target", "schedule.updates=2") == 0
-    capsys.readouterr()
-    for file in ("bad.txt", "bad.npy", "missing.py"):
-        if not file.startswith("missing"):
-            Path(file).write_text(">#G\n")
-        with pytest.raises(SystemExit) as end:
-            evaluate(["run", "--levels", file, "-o", "scores.json"])
-        lines = capsys.readouterr().err.strip().splitlines()
-        assert (
-            end.value.code == (4 if file == "missing.py" else 2)
-            and len(lines) == 1
-            and file in lines[0]
-        )
-        assert not Path("scores.json").exists()
