@@ -110,7 +110,8 @@ class Layout:
         if all(isinstance(part, spaces.Box) and part.dtype.kind == "f" for part in parts):
             return Unbounded(sum(taken.size for taken in self._taken))
         if all(isinstance(part, NUMERIC) and not isinstance(part, spaces.Box) for part in parts):
-            return MultiCategorical([count for part in parts for count in _options(part)])
+            counts = torch.tensor([count for part in parts for count in _options(part)])
+            return MultiCategorical(counts, shape=counts.shape)  # also of a single choice
         raise UnfitEnvironmentError(
             f"action space {space}: there is a policy for a Discrete, a MultiDiscrete or a "
             "MultiBinary one, for a Box of floats, and for dictionaries and tuples of either; a "

@@ -441,6 +441,9 @@ def test_actions_arrive_as_they_were_meant() -> None:
         own = layout.taken(torch.tensor(action))
         assert np.concatenate([own[0], own[1][0]]).tolist() == taken
         assert Robot.action_space.contains(own)
+    single = Layout(Robot.observation_space, spaces.Tuple((spaces.Discrete(2, start=3),)))
+    assert single.acts.shape == (1,)
+    assert single.taken(torch.tensor([[1], [0]]))[0].tolist() == [4, 3]
 
 
 def of(name: str, *values: float) -> dict[str, Any]:
