@@ -27,8 +27,8 @@ from proposer_rl.tasks.ranges import (
     read_part,
     target_in_file,
 )
+from proposer_rl.teaching.numbers import as_numbers
 from proposer_rl.teaching.tables import (
-    doubles,
     expected_log_odds,
     few_columns,
     item_table,
@@ -328,15 +328,17 @@ class Items(LevelSpace):
             number = lines[tuple(wrong[0])]
             what = f"must be finite in float32, as of item {int(wrong[0, 0])}"
             raise ArgumentError(f"features={number:g}: {what}")
-        self.pass_rates = None if pass_rates is None else _rates(pass_rates, count)
+        self.pass_rates = None
+        if pass_rates is not None:
+            rates = as_numbers("pass_rates", pass_rates, (count,), 0, 1, unknown=True)
+            self.pass_rates = torch.from_numpy(rates)
         self.expected = None if self.pass_rates is None else expected_log_odds(self.pass_rates)
-        rates = torch.zeros(count, 0)
+        columns = known = torch.zeros(count, 0)
         if self.pass_rates is not None:
-            rates = rate_columns(self.pass_rates)
-        known = torch.zeros(count, 0)
+            columns = rate_columns(self.pass_rates)
         if features is not None:
-            known = few_columns(lines, others=rates.shape[1])
-        self._inputs = torch.cat([known, rates], 1)
+            known = few_columns(lines, others=columns.shape[1])
+        self._inputs = torch.cat([known, columns], 1)
         low, high = lines.amin(0), lines.amax(0)
         self.coordinates = (2 * (lines - low) / (high - low).clamp_min(1e-12) - 1).float()
         parts: dict[str, _SomeItems] = {}
@@ -515,19 +517,6 @@ def _taken(name: str, levels: Any, count: int) -> Levels:
         shape = list(levels.shape)
         raise ArgumentError(f"{name}={shape}: must give {count} levels, [{count}, ...]")
     return TensorDict({DRAWN: levels}, [count]) if isinstance(levels, Tensor) else levels
-
-
-def _rates(given: Any, count: int) -> Tensor:
-    """Returns pass rates, float64 [N]."""
-    try:
-        rates = doubles(given)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ArgumentError(f"pass_rates={shown(given)}: must be numbers [N]") from error
-    if rates.shape != (count,):
-        raise ArgumentError(f"pass_rates={list(rates.shape)}: must be one for each of {count}")
-    if (wrong := rates[(rates < 0) | (rates > 1)]).numel():
-        raise ArgumentError(f"pass_rates={wrong[0]:g}: must be from 0 to 1, or NaN")
-    return rates
 
 
 def _hash(numbers: Tensor) -> str:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.belief import WIDEST
 from proposer_rl.settings import ArgumentError, shown
+from proposer_rl.teaching.numbers import as_numbers
 
 MOST_TEXTS = 256  # that differ in a column, which is a category
 OUTLIER = 3.0  # standard deviations, beyond which a number of many counts as that
@@ -37,6 +38,8 @@ def number_table(features: Any) -> Tensor:
         ArgumentError: if they are no numbers.
     """
     array = hasattr(features, "__array__") and not isinstance(features, Tensor)
+    if isinstance(features, np.ma.MaskedArray):
+        features = features.astype(np.float64).filled(np.nan)
     try:
         table = torch.as_tensor(np.array(features) if array else features)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -104,23 +107,9 @@ def _is_missing(cell: Any) -> bool:
     return cell is None or (isinstance(cell, float) and math.isnan(cell))
 
 
-def doubles(cells: Any) -> Tensor:
-    """Returns numbers as float64 on the CPU, whatever they are given as and wherever they are.
-
-    Raises:
-        TypeError, ValueError, RuntimeError: if they are no numbers.
-    """
-    if isinstance(cells, Tensor):
-        return cells.detach().cpu().double()
-    return torch.from_numpy(np.array(cells, dtype=np.float64))
-
-
 def _numbers(name: str, column: Any) -> Tensor:
     cells = column if hasattr(column, "__array__") else [*column]
-    try:
-        return doubles(cells).reshape(len(cells), -1)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ArgumentError(f"{name}={shown(column)}: must be numbers or texts") from error
+    return torch.from_numpy(as_numbers(name, cells)).reshape(len(cells), -1)
 
 
 def ranks(table: Tensor) -> Tensor:
