@@ -20,14 +20,9 @@ class MapEncoder(nn.Sequential):
         in_channels: channels of a probe, e.g. its planes and the Solver's logit map.
         channels: channels of the convolutions; each but the first halves the resolution.
         features: number of features of a probe.
-
-    Raises:
-        ValueError: if there is no convolution.
     """
 
     def __init__(self, in_channels: int, channels: Sequence[int], features: int) -> None:
-        if not channels:
-            raise ValueError("channels must have at least 1 item, got []")
         layers: list[nn.Module] = []
         for fan_in, fan_out in zip([in_channels, *channels], channels, strict=False):
             stride = 2 if layers else 1

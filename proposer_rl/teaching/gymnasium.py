@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from torch import Tensor
 
-from proposer_rl.settings import ArgumentError, shown
+from proposer_rl.settings import ArgumentError
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, as_number, entries, stepped
 from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write_attribute
 from proposer_rl.tasks.parameters import SEED
@@ -95,11 +95,6 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         if callable(self._how):
             self._how(self.env.unwrapped, self._level)
         elif isinstance(self._how, str):
-            if not isinstance(self._level, Mapping):
-                raise ArgumentError(
-                    f"set='options': must be a function, as this level has no names: "
-                    f"{shown(self._level)}"
-                )
             options = {**(options or {}), **self._level}
         else:
             self._set(self._how)
@@ -176,10 +171,6 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Sets attributes of the environment to the values of the level."""
         names = [*self._level.keys()] if isinstance(self._level, Mapping) else []
         for name, path in how.items():
-            if name not in names:
-                raise ArgumentError(
-                    f"set.{name}: no parameter; there are: {', '.join(names) or 'none'}"
-                )
             try:
                 write_attribute(self.env.unwrapped, path, _plain(self._level[name]))
             except AttributeRefusedError as error:

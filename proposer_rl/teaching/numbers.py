@@ -54,9 +54,9 @@ def as_numbers(
         array = _array(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise ArgumentError(f"{name}={shown(value)}: must be numbers of float32") from error
-    if spread and not array.ndim:
-        array = np.full(shape, array)
     if shape is not None:
+        if spread and not array.ndim:
+            array = np.full([one or 0 for one in shape], array)
         fits = [wanted in (None, length) for wanted, length in zip(shape, array.shape)]  # noqa: B905
         if len(shape) != array.ndim or not all(fits):
             wanted = "[" + ", ".join("n" if one is None else f"{one}" for one in shape) + "]"

@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from proposer_rl.curricula import outcome_of
 from proposer_rl.models import callers_state
-from proposer_rl.settings import ArgumentError, shown
+from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching.numbers import as_numbers
 
 RESULTS = ("return", "success", "score", "episodes", "steps")
@@ -44,31 +44,14 @@ def by_name(outcome: Any) -> dict[str, Any]:
     """Returns the results of an outcome, or its rollout alone where it has one.
 
     Raises:
-        ArgumentError: if it has no names, no return, or a name that means nothing here.
+        ArgumentError: for a name that means nothing here.
     """
-    if not hasattr(outcome, "keys"):
-        raise ArgumentError(f"outcome={shown(outcome)}: must have results by name, as return")
     names = [*outcome.keys()]
     if "rollout" in names:
         return {"rollout": outcome["rollout"]}
-    if "return" not in names:
-        raise ArgumentError(f"outcome={sorted(names)}: has no return")
     if unknown := [name for name in names if name not in RESULTS]:
         raise ArgumentError(f"outcome.{unknown[0]}: unknown; there are: {', '.join(RESULTS)}")
     return {name: outcome[name] for name in names}
-
-
-def as_device(device: Any) -> torch.device:
-    """Returns a device of this machine.
-
-    Raises:
-        ArgumentError: if there is no such device.
-    """
-    try:
-        return torch.empty(0, device=torch.device(device)).device
-    except (RuntimeError, AssertionError, TypeError) as error:
-        line = str(error).partition("\n")[0]
-        raise ArgumentError(f"device={device}: must be one that torch has here: {line}") from error
 
 
 def as_result(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
@@ -115,7 +98,7 @@ def ended(
         be kept for the next rollout.
 
     Raises:
-        ArgumentError: if it does not say which levels it is of, or has no reward or done.
+        ArgumentError: if it does not say which levels it is of.
     """
     if LEVEL_ID not in rollout.keys():
         raise ArgumentError(
@@ -123,9 +106,6 @@ def ended(
             "began; put LevelTransform around the environment, or give outcome_of(rollout) "
             "where each row begins with a reset on its level"
         )
-    for name in ("reward", "done"):
-        if name not in rollout["next"].keys():
-            raise ArgumentError(f"rollout: has no {name} in next, one number for each environment")
     steps: Any = rollout.contiguous().flatten()  # also where it is stacked lazily
     if MASK in rollout.keys(True):  # rows are filled up to one length
         steps = steps[rollout[MASK].reshape(-1)]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from proposer_rl.curricula.belief import WIDEST
-from proposer_rl.settings import ArgumentError, shown
+from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching.numbers import as_numbers
 
 MOST_TEXTS = 256  # that differ in a column, which is a category
@@ -32,18 +32,11 @@ class Table(NamedTuple):
 
 
 def number_table(features: Any) -> Tensor:
-    """Returns numbers [N, D], whatever they are given as.
-
-    Raises:
-        ArgumentError: if they are no numbers.
-    """
+    """Returns numbers [N, D], whatever they are given as."""
     array = hasattr(features, "__array__") and not isinstance(features, Tensor)
     if isinstance(features, np.ma.MaskedArray):
-        features = features.astype(np.float64).filled(np.nan)
-    try:
-        table = torch.as_tensor(np.array(features) if array else features)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ArgumentError(f"features={shown(features)}: must be numbers [N, D]") from error
+        features = np.ma.filled(features.astype(np.float64), np.nan)
+    table = torch.as_tensor(np.array(features) if array else features)
     return table if table.is_floating_point() else table.long()  # small integers would overflow
 
 
@@ -59,11 +52,6 @@ def item_table(features: Any) -> Table:
     texts = [_begins_with_text(column) for column in columns.values()]
     if not columns or (not any(texts) and hasattr(features, "__array__")):
         return Table(number_table(features).detach().cpu(), None)
-    for name, column in columns.items():
-        if not hasattr(column, "__len__"):
-            raise ArgumentError(f"features.{name}={shown(column)}: must be a column, [N]")
-    if len({len(column) for column in columns.values()}) > 1:
-        raise ArgumentError(f"features={[*columns]}: must have columns of one length")
     parts, codes = [], []
     for (name, column), is_text in zip(columns.items(), texts, strict=True):
         if not is_text:
@@ -88,11 +76,8 @@ def _columns(features: Any) -> dict[str, Any]:
         return {str(name): column for name, column in features.items()}
     if isinstance(features, Tensor) or not _begins_with_text(features):
         return {}
-    try:
-        rows = [[row] if isinstance(row, str) else [*row] for row in features]
-        return {str(place): column for place, column in enumerate(zip(*rows, strict=True))}
-    except (TypeError, ValueError) as error:
-        raise ArgumentError("features: must have rows of one length") from error
+    rows = [[row] if isinstance(row, str) else [*row] for row in features]
+    return {str(place): column for place, column in enumerate(zip(*rows, strict=True))}
 
 
 def _begins_with_text(cells: Any) -> bool:

@@ -25,7 +25,7 @@ from proposer_rl.curricula.ledger import OUT, OVER, RETURNED, Block, Ledger
 from proposer_rl.models import own_state
 from proposer_rl.recipes import Recipe
 from proposer_rl.runs.folder import storage
-from proposer_rl.settings import ArgumentError, Count, checked, shown, whole
+from proposer_rl.settings import ArgumentError, Count, checked, whole
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels, Task
 from proposer_rl.teaching.abilities import adapted
@@ -36,7 +36,6 @@ from proposer_rl.teaching.remote import TeacherClient, TeacherServer
 from proposer_rl.teaching.results import (
     LEVEL_ID,
     RESULTS,
-    as_device,
     as_outcome,
     as_result,
     by_name,
@@ -118,7 +117,7 @@ class Teacher:
         student: Student | None = None,
         **can: Any,
     ) -> None:
-        self.space, self.device, self.block = space, as_device(device), block
+        self.space, self.device, self.block = space, torch.empty(0, device=device).device, block
         self.id = token_hex(4)
         self._seed = whole("seed", seed)
         self.curriculum, self._made_of = make_curriculum(curriculum, space, filter, [self._seed])
@@ -218,12 +217,8 @@ class Teacher:
         pairs = zip(RESULTS, given, strict=True)
         results = {n: one for n, one in pairs if one is not None or n == "return"}
         with self._here():
-            if "rollout" in self.reads:
-                raise ArgumentError("tell: this curriculum reads rollouts; use observe(rollout)")
-            if return_ is None:
-                raise ArgumentError("return_: missing: of each level, such as its success")
-            if success is None:
-                self._require_success(False, "tell it with success=")
+            self._require("rollout", False, "use observe(rollout)")
+            self._require("success", success is not None, "tell it with success=")
             if type(ids) is int:
                 numbers = {name: as_result(name, value, ()) for name, value in results.items()}
                 self._check_score(results)
@@ -310,9 +305,8 @@ class Teacher:
             if "rollout" in results:
                 self._observe_rollout(tickets, results["rollout"])
             else:
-                if "rollout" in self.reads:
-                    raise ArgumentError("outcome: has no rollout, which this curriculum reads")
-                self._require_success("success" in results, "put it into the outcome")
+                for name in ("rollout", "success"):
+                    self._require(name, name in results, "put it into the outcome")
                 self._tell(tickets, results)
                 self._note_known(results)
             if ids is None:
@@ -370,13 +364,11 @@ class Teacher:
         """Puts back what :meth:`state_dict` returned, on whichever device its tensors are.
 
         Raises:
-            ArgumentError: if it is none, of another space, curriculum or setting of it, naming what
+            ArgumentError: if it is of another space, curriculum or setting of it, naming what
                 differs, or tickets are out, as of environments that have begun; then nothing has
                 changed.
         """
         with self._here():
-            if not isinstance(state, Mapping) or not {"of", "ledger"} <= state.keys():
-                raise ArgumentError(f"state={shown(state)}: must be of Teacher.state_dict()")
             state = tree_map_only(Tensor, Tensor.cpu, state)
             for what, now in self._of.items():
                 require_same(what, state["of"][what], now)
@@ -503,7 +495,7 @@ class Teacher:
         parts = self._ledger.find(ids)
         outcome = outcome_of_rollout(rollout, self._success)
         known = "success" in outcome.keys()
-        self._require_success(known, "give Teacher(success=...), or the rollout a next success")
+        self._require("success", known, "give Teacher(success=...), or the rollout a next success")
         numbers = {
             name: as_result(name, outcome[name][0], (len(ids),))
             for name in (("return", "success") if known else ("return",))
@@ -533,9 +525,9 @@ class Teacher:
                     stacklevel=3,
                 )
 
-    def _require_success(self, known: bool, how: str) -> None:
-        if "success" in self.reads and not known:
-            raise ArgumentError(f"success: missing: this curriculum reads it; {how}")
+    def _require(self, name: str, known: bool, how: str) -> None:
+        if name in self.reads and not known:
+            raise ArgumentError(f"{name}: missing: this curriculum reads it; {how}")
 
     def _proposed(self) -> NDArray[np.int64]:
         """Returns the tickets of the one batch that is out."""

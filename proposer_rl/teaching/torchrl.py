@@ -222,16 +222,13 @@ class LevelTransform(Transform):
 
     def _of_each(self, name: str, rule: Any, after: TensorDictBase) -> Tensor:
         """Returns one number of each environment, [n], by an entry or a function."""
-        how = "it must be one number for each environment, an entry or a function of next"
-        entry = rule(after) if callable(rule) else after.get(rule, None)
-        if entry is None:
-            there = ", ".join(
-                key if isinstance(key, str) else ".".join(key) for key in after.keys(True, True)
-            )
-            raise ArgumentError(f"{name}={rule!r}: no entry of next, which has {there}; {how}")
+        entry = rule(after) if callable(rule) else after[rule]
         batch = self.parent.batch_size
         if entry.numel() != batch.numel() or entry.shape[: len(batch)] != batch:
-            raise ArgumentError(f"{name}: has the shape {[*entry.shape]}, not {[*batch, 1]}; {how}")
+            raise ArgumentError(
+                f"{name}: has the shape {[*entry.shape]}, not {[*batch, 1]}; it must be "
+                "one number for each environment, an entry or a function of next"
+            )
         return entry.reshape(-1)
 
     def _success(self, after: TensorDictBase) -> Any:

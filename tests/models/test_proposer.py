@@ -62,11 +62,6 @@ def test_an_encoder_of_maps_reads_each_by_itself() -> None:
     torch.testing.assert_close(features[1, 2], encoder(probes[1:, 2:])[0, 0])
 
 
-def test_an_encoder_of_maps_has_a_convolution() -> None:
-    with pytest.raises(ValueError, match=r"channels must have at least 1 item, got \[\]"):
-        MapEncoder(7, [], 5)
-
-
 def test_without_probes_every_state_looks_alike() -> None:
     logits, value = network()(torch.rand(3, 0, 7, 10, 10))
     assert logits.shape == (3, 6, 5)

@@ -175,11 +175,6 @@ def test_a_forked_teacher_is_refused() -> None:
         (lambda: cartpole("attributes"), "set='attributes': must be"),
         (lambda: cartpole({"gravity": "gravty"}).reset(), "set.gravity='gravty': CartPoleEnv has"),
         (lambda: cartpole({"gravity": "a.b"}).reset(), "set.gravity='a.b': CartPoleEnv has no"),
-        (lambda: cartpole({"mass": "gravity"}).reset(), "set.mass: no parameter; there are: grav"),
-        (
-            lambda: prl.TaughtEnv(LevelEnv(), counted(), {"g": "g"}).reset(),
-            "set.g: no parameter; there are: none",
-        ),
     ],
 )
 def test_what_is_wrong_is_named(make: Any, message: str) -> None:
@@ -205,12 +200,6 @@ def test_success_is_what_the_rule_says(rule: str) -> None:
     assert {n: s for n, (_, s) in seen(teacher).items()} == {
         n: expected.get(n, RULES[rule]) for n in range(4)
     }
-
-
-def test_options_need_names() -> None:
-    env = prl.TaughtEnv(LevelEnv(), prl.Teacher("plr", prl.Items(1)), "options")
-    with pytest.raises(ArgumentError, match=r"^set='options': must be a function, as this level"):
-        env.reset()
 
 
 def answering(**members: Any) -> gymnasium.Env[Any, Any]:

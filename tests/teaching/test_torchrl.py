@@ -290,17 +290,10 @@ AGENTS, OBJECTIVES = (("agents", "reward"), (2, 1)), ("reward", (2,))
     [
         (
             partial(Several, *AGENTS),
-            {},
-            "reward='reward': no entry of next, .*agents.reward",
-        ),
-        (
-            partial(Several, *AGENTS),
             {"reward": ("agents", "reward")},
             r"reward: has the shape \[3, 2, 1\], not \[3, 1\]; it must be one number for each",
         ),
         (partial(Several, *OBJECTIVES), {}, r"reward: has the shape \[3, 2\], not \[3, 1\]"),
-        (LevelsEnv, {"success": "won"}, "success='won': no entry of next, which has .*success"),
-        (LevelsEnv, {"success": "observatio"}, "success='observatio': no entry"),
         (partial(SerialEnv, 2, LevelsEnv), {}, "env: levels .* of SerialEnv from outside"),
         (
             partial(ParallelEnv, 2, LevelsEnv),
