@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -60,6 +61,8 @@ from proposer_rl.teaching import (
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from proposer_rl.tasks.policy import Policy
 
 __all__ = [
     "DEFAULT_METHOD",
@@ -129,10 +132,14 @@ class Run:
     """A run's folder, read.
 
     Attributes:
-        folder: what ``bin/watch``, ``bin/report``, ``bin/eval`` and ``bin/play`` take, too.
+        folder: its path, which is made absolute; what ``bin/watch``, ``bin/report``, ``bin/eval``
+            and ``bin/play`` take, too.
     """
 
     folder: Path
+
+    def __init__(self, folder: str | PathLike[str]) -> None:
+        object.__setattr__(self, "folder", Path(folder).expanduser().absolute())
 
     @property
     def metrics(self) -> pd.DataFrame:
@@ -147,7 +154,7 @@ class Run:
     @property
     def summary(self) -> dict[str, Any]:
         """The run's last measurements, its costs, and when it reached the threshold."""
-        content: dict[str, Any] = json.loads((self.folder / "summary.json").read_text())
+        content: dict[str, Any] = json.loads((self.folder / "summary.json").read_bytes())
         return content
 
     @property
@@ -158,6 +165,19 @@ class Run:
     def solver(self) -> ActorCritic:
         """Returns the trained Solvers of the newest checkpoint; see :meth:`ActorCritic.actor`."""
         return self._stored()[1]
+
+    def policy(self, seed: int | None = None) -> Policy:
+        """Returns one trained Solver for Gymnasium, TorchRL and ``torch.export``.
+
+        Args:
+            seed: whose, of a run of several seeds; None for the first.
+        """
+        from proposer_rl.cli.stored import stored_run
+        from proposer_rl.tasks.policy import policy_of
+
+        run = stored_run(self.folder)
+        chosen = run.config.seeds[0] if seed is None else seed
+        return policy_of(run.task, run.stage(seeds=[chosen]).learner)
 
     def task(self) -> Task:
         """Returns the task that they were trained on."""
@@ -216,8 +236,10 @@ def train(
         DivergedError: if a number is not finite; the checkpoint before stays.
         Interrupted: if a signal asked the run to stop; all is saved then.
     """
+    state = random.getstate()
     from proposer_rl.cli.compose import compose_and_run
 
+    random.setstate(state)  # rich, which shows a run, draws from it as it is imported
     given: dict[str, tuple[Any, Any, str]] = {
         "scale": (scale, str, "a name"),
         "filter": (filter, str | Mapping, "a name, settings"),

@@ -20,3 +20,13 @@ def install_command(extra: str) -> str:
     if constraints.is_file():
         what = ["-c", str(constraints), "-e", f"{ROOT}[{extra}]"]
     return shlex.join([sys.executable, "-m", "pip", "install", *what])
+
+
+def where_to_look(error: BaseException) -> str:
+    """Returns how a module is found that could not be imported; nothing for other errors."""
+    if not isinstance(error, ModuleNotFoundError):
+        return ""
+    return (
+        f"; {sys.executable} has looked for it: install it there, or if it is your own, name its "
+        "folder, as in PYTHONPATH=. bin/train ..."
+    )

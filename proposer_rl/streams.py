@@ -6,8 +6,11 @@ import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from operator import index
+from threading import RLock
 
 import torch
+
+DEFAULT = RLock()  # torch's default generator is one for all threads
 
 
 class Streams:
@@ -55,7 +58,7 @@ class Streams:
 
         For code that takes no generator, such as the initialisation of layers.
         """
-        with torch.random.fork_rng(devices=[]):
+        with DEFAULT, torch.random.fork_rng(devices=[]):
             # torch.manual_seed would seed the generators of GPUs, too.
             torch.default_generator.manual_seed(self._seed_of(*key))
             yield

@@ -16,11 +16,8 @@ from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import INTERVALS
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, from_csv, to_csv
-from proposer_rl.runs.folder import is_rate, read_bounded
-from proposer_rl.runs.records import encoded, number, printable, words
-
-LARGEST_FILE = 2**24
-LONGEST_NAME = 1024  # characters; a file of levels is named by its path
+from proposer_rl.runs.folder import is_rate
+from proposer_rl.runs.records import encoded, number, words
 
 
 class Score(NamedTuple):
@@ -55,13 +52,13 @@ def write_scores(scores: Iterable[Score]) -> bytes:
 def read_scores(file: Path) -> list[Score]:
     """Scores as ``bin/research scores`` writes them."""
     try:
-        rows = csv.DictReader(io.StringIO(read_bounded(file, LARGEST_FILE).decode()))
+        rows = csv.DictReader(io.StringIO(file.read_text(encoding="utf-8-sig")))
         return [
             Score(
                 from_csv(row["run"]),
                 int(row["seed"]),
                 int(row["updates"]),
-                stored_name(from_csv(row["levels"])),
+                from_csv(row["levels"]),
                 int(row["size"]),
                 number(float(row["success"] or "nan")),
                 number(float(row["returns"] or "nan")),
@@ -69,13 +66,8 @@ def read_scores(file: Path) -> list[Score]:
             )
             for row in rows
         ]
-    except (csv.Error, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (csv.Error, ValueError, KeyError, TypeError) as error:
         raise UnreadableRun(f"{file}: holds no scores of runs of bin/research scores") from error
-
-
-def stored_name(levels: str) -> str:
-    """What of the name of a set of levels is kept: one line, of ``LONGEST_NAME`` characters."""
-    return printable(levels)[:LONGEST_NAME]
 
 
 def check_names(runs: Iterable[Run]) -> None:

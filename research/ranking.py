@@ -105,10 +105,8 @@ def needs_of(group: Group, needs: Needs, unknown: Collection[str] = ()) -> set[s
         unknown: of a method of which nobody knows.
     """
     run = group.runs[0]
-    about = run.facts.get("about")
-    said = about.get("needs") if isinstance(about, Mapping) else None
-    known = set(needs.get(run.method, unknown))
-    found = set(filter(None, said.split(", "))) if isinstance(said, str) else known
+    said = run.facts.get("about", {}).get("needs")
+    found = set(needs.get(run.method, unknown) if said is None else filter(None, said.split(", ")))
     # Where performance is played, an evaluation is episodes.
     exact = [each for each in group.runs if each.task.exact is not False]
     asked = any(each.last("evaluations") > 0 for each in exact)

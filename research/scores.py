@@ -28,13 +28,11 @@ from proposer_rl.report.studies import read_studies
 from proposer_rl.runs.checkpoint import CheckpointError, checkpoint_files
 from proposer_rl.runs.folder import storage, write_atomically
 from research.generalisation import (
-    LONGEST_NAME,
     Score,
     check_names,
     generalisation_table,
     read_scores,
     scored,
-    stored_name,
     whole,
     write_scores,
 )
@@ -48,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def compare(folders: Sequence[Path], names: Sequence[str], output: Path | None) -> None:
     """Print a table of methods; new scores are added to the output where there is one."""
-    _check(names, output)
+    check_file("output", output, ".csv")
     studies, notes = read_studies(find_runs(folders), None)
     scores = _stored(output)
     runs = whole(group for study in studies for group in study.groups)
@@ -79,17 +77,6 @@ def compare(folders: Sequence[Path], names: Sequence[str], output: Path | None) 
         for row in table_of.texts():
             table.add_row(*map(Text, row))
         Console().print(table)
-
-
-def _check(names: Sequence[str], output: Path | None) -> None:
-    """Refuse what cannot be, before anything is read."""
-    for name in names:
-        if name != (stored := stored_name(name)):
-            raise ConfigError(
-                f"--levels {stored:.80}: must be of one line, of at most {LONGEST_NAME} printable "
-                "characters"
-            )
-    check_file("output", output, ".csv")
 
 
 def _stored(output: Path | None) -> list[Score]:

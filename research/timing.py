@@ -12,10 +12,8 @@ import numpy as np
 
 from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.runs.folder import read_bounded
-from proposer_rl.runs.records import number, printable
+from proposer_rl.runs.records import number
 
-LARGEST_FILE = 2**20
 BENCHMARK = "curricula"
 
 Seconds = Mapping[str, float]  # of an update, by the method's label
@@ -45,7 +43,6 @@ def read_timing(files: Sequence[Path]) -> Timing:
     Raises:
         UnreadableRun: if a file holds something else, or methods that were timed beside none of
             those before.
-        StorageError: if one cannot be read.
     """
     found = _read(files[0])
     for file in files[1:]:
@@ -75,7 +72,7 @@ def _joined(found: Seconds, other: Seconds) -> Seconds:
 
 def _read(file: Path) -> Timing:
     try:
-        found: Any = json.loads(read_bounded(file, LARGEST_FILE))
+        found: Any = json.loads(file.read_text(encoding="utf-8-sig"))
         measured, machine = found["benchmarks"][BENCHMARK], found["machine"]
         samples = measured["result"]["rows"][0]["samples"]
         rounds = [
@@ -85,9 +82,9 @@ def _read(file: Path) -> Timing:
         if not rounds or not all(value > 0 for each in rounds for value in each.values()):
             raise ValueError("no times")
         seconds = {name: float(np.median([each[name] for each in rounds])) for name in samples}
-        device = printable(str(machine.get("gpu", machine["processor"])))
+        device = machine.get("gpu", machine["processor"])
         return Timing(seconds, rounds, f"{device}, threads: {int(measured['threads'])}")
-    except (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, IndexError) as error:
         raise UnreadableRun(
             f"{file}: holds no seconds of methods as bin/bench {BENCHMARK} --runs writes them"
         ) from error

@@ -8,18 +8,21 @@ since threads do not survive a fork.
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import gc
 import json
 import os
 import resource
+import select
 import subprocess
 import sys
+import termios
 import time
 from dataclasses import dataclass, field
 from importlib import import_module
 from itertools import count
 from pathlib import Path
-from signal import SIGKILL
+from signal import SIG_IGN, SIGKILL, signal
 from threading import RLock
 from typing import Any
 
@@ -57,6 +60,10 @@ class Request:
             it is SIGKILL and the write is the fsync of a new checkpoint, half of that is there.
         largest_file: bytes; RLIMIT_FSIZE.
         as_anyone: give up root's right to write where permissions forbid it.
+        lost_at: index of the write before which nobody reads any more what it says, neither its
+            standard output nor its errors. It is a pipe's other end that is closed.
+        terminal: it is a terminal that is closed, which hangs up: SIGHUP.
+        ignored: signals that it ignores from the start, as after ``nohup`` or ``disown``.
         folder: where the child works.
         module: whose ``main`` is called, with the arguments in ``sys.argv``.
     """
@@ -66,6 +73,9 @@ class Request:
     signal_at: dict[int, int] = field(default_factory=dict)
     largest_file: int | None = None
     as_anyone: bool = False
+    lost_at: int | None = None
+    terminal: bool = False
+    ignored: list[int] = field(default_factory=list)
     folder: str = "."
     module: str = "proposer_rl.cli.train"
 
@@ -146,10 +156,17 @@ def serve() -> None:
 
 def _fork(request: Request) -> Ended:
     said, counted = os.memfd_create("output"), os.memfd_create("writes")
+    reader, writer = os.openpty() if request.terminal else os.pipe()
     started = time.monotonic()
     child = os.fork()
     if child == 0:
-        _become_child(request, said, counted)
+        os.close(reader)
+        _become_child(request, said if request.lost_at is None else writer, counted)
+    os.close(writer)
+    if request.lost_at is not None:
+        while _writes(counted)[request.lost_at :] == [] and not _has_ended(child):
+            time.sleep(0.001)
+    os.close(reader)
     for delay, signum in request.signals:
         while time.monotonic() - started < delay and not _has_ended(child):
             time.sleep(0.001)
@@ -157,11 +174,15 @@ def _fork(request: Request) -> Ended:
             os.kill(child, signum)
     _, status = os.waitpid(child, 0)
     seconds = time.monotonic() - started
-    writes = os.pread(counted, 1 << 20, 0).decode().splitlines()
+    writes = _writes(counted)
     output = os.pread(said, 1 << 20, 0).decode()
     os.close(said)
     os.close(counted)
     return Ended(os.waitstatus_to_exitcode(status), seconds, output, writes)
+
+
+def _writes(counted: int) -> list[str]:
+    return os.pread(counted, 1 << 20, 0).decode().splitlines()
 
 
 def _has_ended(child: int) -> bool:
@@ -172,10 +193,16 @@ def _has_ended(child: int) -> bool:
 def _become_child(request: Request, said: int, counted: int) -> None:
     code = 1
     try:
+        for signum in request.ignored:
+            signal(signum, SIG_IGN)
+        if request.terminal:
+            os.setsid()
+            fcntl.ioctl(said, termios.TIOCSCTTY, 0)
         os.dup2(said, 1)
         os.dup2(said, 2)
+        os.close(said)
         os.chdir(request.folder)
-        _note_writes(request.signal_at, counted)
+        _note_writes(request.signal_at, request.lost_at, counted)
         if request.largest_file is not None:
             limit = (request.largest_file, request.largest_file)
             resource.setrlimit(resource.RLIMIT_FSIZE, limit)
@@ -197,8 +224,11 @@ def _become_child(request: Request, said: int, counted: int) -> None:
         os._exit(code)
 
 
-def _note_writes(signal_at: dict[int, int], noted: int) -> None:
-    """Write a line to ``noted`` for every fsync and replace, and signal at some of them."""
+def _note_writes(signal_at: dict[int, int], lost_at: int | None, noted: int) -> None:
+    """Write a line to ``noted`` for every fsync and replace, and signal at some of them.
+
+    At ``lost_at`` it waits until nobody reads what the process says.
+    """
     originals = {name: getattr(os, name) for name in ("fsync", "replace")}
     indices = count()
 
@@ -206,7 +236,12 @@ def _note_writes(signal_at: dict[int, int], noted: int) -> None:
         path = Path(os.readlink(f"/proc/self/fd/{file}") if name == "fsync" else str(file))
         if path.name != f".{PROGRESS}.tmp":
             os.write(noted, f"{name} {path.name}\n".encode())
-            signum = signal_at.get(next(indices))
+            index = next(indices)
+            if index == lost_at:
+                hung_up = select.poll()
+                hung_up.register(1, 0)
+                hung_up.poll()
+            signum = signal_at.get(index)
             if signum is not None:
                 if signum == SIGKILL and name == "fsync" and path.name.startswith(".step_"):
                     os.ftruncate(file, os.fstat(file).st_size // 2)

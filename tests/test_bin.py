@@ -123,6 +123,26 @@ def test_bytecode_that_may_not_lie_beside_sources_is_kept_elsewhere(
     assert ended.stdout.strip() == expected.format(root=root)
 
 
+def test_a_checkout_that_others_may_only_read_says_who_renews_its_environment(
+    bare: tuple[Path, dict[str, str]],
+) -> None:
+    root, environment = bare
+    (root / ".venv").mkdir()
+    (root / ".venv").chmod(0o555)
+    command: list[str | Path] = [root / "bin" / "train"]
+    if os.geteuid() == 0:  # who may write everywhere
+        if not shutil.which("setpriv"):
+            pytest.skip("root can be no other user without setpriv")
+        for folder in root.parents:
+            if folder.owner() == "root" and folder != Path("/"):
+                folder.chmod(folder.stat().st_mode | 0o055)
+        command = ["setpriv", "--reuid=12345", "--regid=12345", "--clear-groups", *command]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    (line,) = ended.stderr.splitlines()
+    assert ended.returncode == 1 and "is not up to date with pyproject.toml" in line
+    assert f"its owner, {root.owner()}, renews it" in line
+
+
 def test_the_site_needs_only_its_own_extra() -> None:
     assert "use_environment docs\n" in (BIN / "docs").read_text(encoding="utf-8")
     assert "use_environment dev\n" in (BIN / "test").read_text(encoding="utf-8")

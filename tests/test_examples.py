@@ -16,7 +16,6 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
-import proposer_rl as prl
 from proposer_rl.curricula import TaskStudent, outcome_of
 from proposer_rl.meta.rewards import TrainingStep
 from proposer_rl.runs.folder import read_csv
@@ -220,10 +219,3 @@ def test_curricula_in_other_loops_run(
 def test_each_loop_is_short() -> None:
     for file in EXAMPLES.glob("taught_*.py"):
         assert len(file.read_text(encoding="utf-8").splitlines()) <= 60, file.name
-
-
-def test_a_curriculum_draws_prompts(example: Load) -> None:
-    pytest.importorskip("trl")
-    prompts = example("taught_prompts")
-    within, solved = prompts.main(prl.curricula.plr(**prompts.REPLAY), steps=3)
-    assert 0 <= within <= 1 and 0 <= solved <= 100

@@ -9,10 +9,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from hydra.errors import MissingConfigException
 
 from proposer_rl import extras
-from proposer_rl.cli.groups import LAUNCHERS, explained
 from proposer_rl.extras import install_command
 from tests.test_packaging import PROJECT, ROOT
 
@@ -25,7 +23,7 @@ def test_only_extras_that_there_are_are_asked_for() -> None:
     sources = [path.read_text(encoding="utf-8") for path in (ROOT / "proposer_rl").rglob("*.py")]
     asked = {name for source in sources for name in CALL.findall(source)}
     named = {name.strip("\"'") for name in asked if name[0] in "\"'"}
-    assert named == {"alp-gmm", "launchers", "play", "ray"}
+    assert named == {"alp-gmm", "play", "ray"}
     # The others are the definition, the logger's, whose extra has its name, and a setting of tasks.
     assert asked - {f"'{name}'" for name in named} == {"extra: str", "settings.type", "extra"}
     assert named | {"tensorboard", "wandb"} <= EXTRAS.keys()
@@ -52,12 +50,3 @@ def test_of_an_installed_package_the_line_names_it(
     monkeypatch.setattr(extras, "ROOT", tmp_path)
     command = shlex.split(install_command("alp-gmm"))
     assert command == [sys.executable, "-m", "pip", "install", "proposer_rl[alp-gmm]"]
-
-
-def test_a_launcher_that_is_missing_is_told_from_one_that_there_is_not() -> None:
-    for file in LAUNCHERS:
-        error = MissingConfigException("Could not find it", file, ["basic"])
-        line = f"{file}: its package is missing; install it with: {install_command('launchers')}"
-        assert explained(error) == line
-    error = MissingConfigException("Could not find it", "hydra/launcher/jobs", ["basic"])
-    assert explained(error) == "hydra/launcher/jobs: unknown; choose one of: basic"

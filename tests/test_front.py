@@ -5,9 +5,11 @@ from __future__ import annotations
 import inspect
 import json
 import re
+from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 from functools import partial
 from io import BytesIO, TextIOWrapper
+from itertools import count
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -38,6 +40,7 @@ from proposer_rl.recipes import (
 )
 from tests.commands import trained_run
 from tests.curricula.test_scores import DOTTED, shortfall
+from tests.processes import python
 from tests.same_run import assert_same_run
 from tests.tiny import EXAMPLES
 
@@ -120,7 +123,7 @@ def test_a_run_in_a_maze_is_that_of_the_command_line(
     assert run.solver().copies == 1 and levels.batch_size == (2,)
     capsys.readouterr()
     watch([str(run.folder), "--once"])
-    assert "plr" in capsys.readouterr().out
+    assert "6/6" in capsys.readouterr().out
     evaluate([str(run.folder), "--levels", "id", "-o", str(tmp_path / "rows.json")])
     monkeypatch.setattr("proposer_rl.report.build.DRAWINGS", [])
     report([str(run.folder), "-q", "-o", str(tmp_path / "report")])
@@ -174,16 +177,11 @@ def test_runs_of_one_second_have_folders_of_their_own(
     """And where signs are printed that standard output does not have, they end well."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("proposer_rl.cli.compose.datetime", Frozen)
-    with pytest.raises(ValueError, match="updates=0"):
-        prl.train("maze", "target", updates=0, **SMOKE)
-    assert not Path("outputs").exists()
     for encoding in ("ascii", "latin-1"):
         out = TextIOWrapper(BytesIO(), encoding)
         monkeypatch.setattr("sys.stdout", out)
         prl.train("maze", "target", updates=1, **SMOKE)
-        assert out.errors == "strict"
         watch(["outputs", "--once"])
-        assert out.errors == "replace"
         monkeypatch.undo()
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr("proposer_rl.cli.compose.datetime", Frozen)
@@ -304,6 +302,56 @@ def test_settings_of_recipes_are_checked_where_they_are_given() -> None:
         recipe_function("task", "gymnasium")(max_steps=3)
     with pytest.raises(prl.ArgumentError, match=r"'a\.b': a name must begin with a letter"):
         override_value({"a.b": 1})
+
+
+def test_runs_in_threads_are_those_that_they_are_alone(tmp_path: Path) -> None:
+    """As Optuna's n_jobs=2 and asyncio.to_thread make them (hydra#2010, optuna#1727)."""
+
+    def train(where: str, seed: int, method: str) -> prl.Run:
+        folder = tmp_path / where / method
+        return prl.train("maze", method, seed=seed, updates=2, folder=folder, **SMOKE)
+
+    methods = ["plr", "target", "perf_gain"]
+    with ThreadPoolExecutor(len(methods)) as pool:
+        runs = list(pool.map(partial(train, "threads"), count(), methods))
+    for seed, (method, run) in enumerate(zip(methods, runs, strict=True)):
+        said = json.loads((run.folder / "run.json").read_text())["overrides"]
+        assert f"+method={method}" in said and f"seed={seed}" in said
+        assert_same_run(run.folder, train("alone", seed, method).folder)
+
+
+def test_a_run_is_read_wherever_the_process_is_by_then(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    runs = [
+        prl.train("maze", "target", updates=1, folder=folder, **SMOKE)
+        for folder in (None, "run", "~/run")
+    ]
+    assert not Path("~").exists() and Path("home/run/summary.json").exists()
+    runs += [prl.Run("run"), prl.Run(Path("home", "run"))]
+    monkeypatch.chdir(tmp_path.parent)
+    assert all(run.folder.is_absolute() and len(run.metrics) == 2 for run in runs)
+    assert runs[1].summary["updates"] == 1 and runs[1].solver().copies == 1
+    assert runs[1] == runs[3]
+
+
+def test_a_run_draws_nothing_from_the_callers_generators(tmp_path: Path) -> None:
+    """Nor do the modules that it imports: therefore in a process of its own."""
+    code = (
+        "import random; import proposer_rl as prl; import numpy, torch; "
+        "state = lambda: (random.getstate(), numpy.random.get_state()[1].tolist(), "
+        "torch.get_rng_state().tolist()); before = state(); "
+        f"prl.train('maze', 'plr', updates=1, folder='run', **{SMOKE}); assert state() == before"
+    )
+    ended = python(code, path=CONFIG_FOLDER.parent, folder=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+
+
+def test_the_package_that_is_named_as_a_tasks_file_says_so() -> None:
+    with pytest.raises(TypeError, match=r"see prl.tasks.from_gymnasium\(env_id, ...\)$"):
+        prl.tasks.gymnasium(env_id="CartPole-v1")
 
 
 def test_a_hydra_around_a_run_is_left_as_it_was(tmp_path: Path) -> None:

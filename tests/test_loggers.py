@@ -1,47 +1,80 @@
 from __future__ import annotations
 
 import json
+import struct
 import sys
 from collections.abc import Iterator
-from functools import partial
-from io import BytesIO
 from pathlib import Path
+from signal import SIGKILL
 from types import ModuleType
 from typing import Any
 
-import numpy as np
 import pytest
-from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import proposer_rl
 from proposer_rl.cli.config import LoggerSettings
 from proposer_rl.cli.errors import ConfigError
-from proposer_rl.cli.loggers import log_of, logger, require_logger
-from proposer_rl.cli.shown import last_map
-from tests.report.folders import LEVEL, PIXELS, cycle, write_run
+from proposer_rl.cli.loggers import logger, require_logger
+from proposer_rl.runs.folder import read_csv, read_jsonl
+from tests import commands
+from tests.processes import Processes
 
+BLOCK = 2**15  # bytes, of a file of Weights & Biases
+LITTLE = [*commands.SMOKE, "schedule.checkpoint_every=2", "schedule.updates=6"]
 SMOKE = ["+method=target", "+scale=smoke", "compute.progress=false", "hydra.run.dir=run"]
 
 
 def test_the_runs_folder_is_enough_for_csv(tmp_path: Path) -> None:
-    with logger(LoggerSettings(type="csv"), tmp_path, "run", {}) as write:
-        assert write is None
+    with logger(LoggerSettings(type="csv"), tmp_path, "run", {}) as log:
+        assert log is None
+
+
+def scalars(folder: Path, name: str) -> list[tuple[int, float]]:
+    """The points of a curve, as TensorBoard shows it."""
+    (events,) = {file.parent for file in folder.rglob("events.out.*")}
+    found = EventAccumulator(str(events)).Reload()
+    return [(event.step, event.value) for event in found.Scalars(name)]
 
 
 def test_rows_and_settings_go_to_tensorboard(tmp_path: Path) -> None:
     config = {"method": "plr", "solver": {"ppo": {"gamma": 0.9}}}
-    with logger(LoggerSettings(type="tensorboard"), tmp_path, "run", config) as write:
-        log = log_of(write, lambda: None)
+    with logger(LoggerSettings(type="tensorboard"), tmp_path, "run", config) as log:
         log("metrics", {"id_success": 0.25, "frames": 100}, 10)
         log("metrics", {"id_success": 0.5, "frames": 200}, 20)
-        log("cycles", {"shares": {"way": [0.25, 0.75]}}, 20)
+        log("cycles", {"shares": {"way": [0.25, 0.75]}, "gain": [0.5, -1.0], "levels": {}}, 20)
+    assert scalars(tmp_path, "metrics/id_success") == [(10, 0.25), (20, 0.5)]
+    assert scalars(tmp_path, "cycles/shares/way") == [(20, 0.5)]
+    assert scalars(tmp_path, "cycles/gain_max") == [(20, 0.5)]
+    assert scalars(tmp_path, "cycles/gain_mean") == [(20, -0.25)]
     (folder,) = {file.parent for file in tmp_path.rglob("events.out.*")}
-    events = EventAccumulator(str(folder)).Reload()
-    found = [(event.step, event.value) for event in events.Scalars("metrics/id_success")]
-    assert found == [(10, 0.25), (20, 0.5)]
-    assert [event.value for event in events.Scalars("cycles/shares/way")] == [0.5]
-    (event,) = events.Tensors("config/solver/text_summary")
+    (event,) = EventAccumulator(str(folder)).Reload().Tensors("config/solver/text_summary")
     assert event.tensor_proto.string_val == [b"{'ppo': {'gamma': 0.9}}"]
+
+
+@pytest.mark.parametrize("method", ["target", "plr"])
+def test_a_run_that_was_killed_and_goes_on_has_each_step_once_in_tensorboard(
+    method: str, processes: Processes, tmp_path: Path
+) -> None:
+    """As lanpa/tensorboardX#185; rows after its last checkpoint are logged twice."""
+    command = [f"+method={method}", *LITTLE, "logger=tensorboard", "schedule.cycle_length=2"]
+    whole = processes(*command, f"hydra.run.dir={tmp_path / 'whole'}")
+    assert whole.code == 0, whole.output
+    rows = [at for at, write in enumerate(whole.writes) if write == "fsync metrics.csv"]
+    run = [*command, f"hydra.run.dir={tmp_path / 'run'}"]
+    for row in (rows[1], rows[2]):  # before the first checkpoint of its own, and after it
+        assert processes(*run, signal_at={row + 2: int(SIGKILL)}).code == -SIGKILL
+    assert processes(*run).code == 0
+    assert processes(*run, "schedule.updates=8").code == 0
+    for table, name in (("metrics.csv", "id_success"), ("training.csv", "loss_critic")):
+        kept = [(row["updates"], row[name]) for row in read_csv(tmp_path / "run" / table)]
+        logged = scalars(tmp_path / "run", f"{table[:-4]}/{name}")
+        assert [step for step, _ in logged] == [step for step, _ in kept]
+        assert [value for _, value in logged] == pytest.approx([value for _, value in kept])
+    if method == "plr":
+        logged = scalars(tmp_path / "run", "cycles/cycle")
+        kept = read_jsonl(tmp_path / "run" / "cycles.jsonl")
+        assert logged == [(row["updates"], row["cycle"]) for row in kept]
 
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,50 +85,17 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         require_logger(LoggerSettings(type="wandb", mode="disabled"))
 
 
-def test_levels_and_proposals_go_to_tensorboard_as_images(tmp_path: Path) -> None:
-    cycles = [cycle(0, [0.25, -0.5], [[6, 0, 0], [0, 0, 0]])]
-    folder = write_run(tmp_path / "run", "perf_gain", cycles=cycles)
-    with logger(LoggerSettings(type="tensorboard"), folder, "run", {}) as write:
-        log = log_of(write, partial(last_map, folder))
-        log("cycles", cycles[0], 20)
-        log("cycles", {"levels": {"best": [LEVEL], "none": []}}, 20)
-        log("curriculum", {"levels": [LEVEL, {"picture": "none"}, *[LEVEL] * 4]}, 20)
-    (events_folder,) = {file.parent for file in tmp_path.rglob("events.out.*")}
-    events = EventAccumulator(str(events_folder)).Reload()
-    assert [event.value for event in events.Scalars("cycles/return_gain_max")] == [0.25]
-    assert [event.value for event in events.Scalars("cycles/return_gain_mean")] == [-0.125]
-    (event,) = events.Images("curriculum/levels")
-    shown = np.asarray(Image.open(BytesIO(event.encoded_image_string)))
-    assert shown.shape == (2 * 20 + 8, 4 * 40 + 3 * 8, 3)  # five pictures, four in a row
-    assert np.array_equal(shown[:20, 48:88], PIXELS) and np.array_equal(shown[28:, :40], PIXELS)
-    assert (shown[20:28] == 255).all() and (shown[28:, 48:] == 255).all()
-    (event,) = events.Images("cycles/best")
-    assert (event.height, event.width) == (20, 40)
-    (event,) = events.Images("cycles/histogram")
-    assert event.step == 20 and event.width > 200
-
-
 class Stand(ModuleType):
     """In the place of the package wandb, which the tests' environment does not have."""
-
-    Error = type("Error", (Exception,), {})
 
     def __init__(self) -> None:
         super().__init__("wandb")
         self.runs: list[dict[str, Any]] = []
-        self.rows: list[tuple[int, dict[str, Any]]] = []
         self.ended: list[int] = []
-        self.Image = lambda pixels: pixels.shape
-
-    def login(self) -> None:
-        raise self.Error("No API key configured.\nUse `wandb login` to log in.")
 
     def init(self, **options: Any) -> Stand:
         self.runs.append(options)
         return self
-
-    def log(self, row: dict[str, Any], step: int) -> None:
-        self.rows.append((step, row))
 
     def finish(self, exit_code: int = 0) -> None:
         self.ended.append(exit_code)
@@ -107,20 +107,6 @@ def stand(monkeypatch: pytest.MonkeyPatch) -> Stand:
     monkeypatch.setitem(sys.modules, "wandb", module)
     monkeypatch.setattr("proposer_rl.cli.loggers.find_spec", lambda name: name)
     return module
-
-
-@pytest.mark.usefixtures("own_folder")
-@pytest.mark.parametrize("variable", [None, "online"])
-def test_without_an_account_one_line_and_nothing_written(
-    variable: str | None, stand: Stand, train, capsys, monkeypatch
-) -> None:
-    monkeypatch.delenv("WANDB_MODE", raising=False)
-    if variable:
-        monkeypatch.setenv("WANDB_MODE", variable)
-    assert train(*SMOKE, "logger=wandb") == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith("error: logger=wandb: No API key configured. Use `wandb login`")
-    assert not Path("run").exists() and not stand.runs
 
 
 def test_what_is_given_goes_before_the_variables_of_weights_and_biases(
@@ -145,29 +131,53 @@ def test_what_is_given_goes_before_the_variables_of_weights_and_biases(
 
 
 def records(folder: Path) -> Iterator[Any]:
-    """What Weights & Biases has written of a run without a network."""
+    """What Weights & Biases has written of a run without a network, in LevelDB's format of logs."""
     from wandb.proto.wandb_internal_pb2 import Record
-    from wandb.sdk.internal.datastore import DataStore
 
     (file,) = folder.glob("*.wandb")
-    store = DataStore()
-    store.open_for_scan(str(file))
-    while (data := store.scan_data()) is not None:
-        yield Record.FromString(data)
+    content, at, data = file.read_bytes(), 7, b""
+    while at + 7 <= len(content):
+        if (left := BLOCK - at % BLOCK) < 7:
+            at += left
+            continue
+        length, kind = struct.unpack("<HB", content[at + 4 : at + 7])
+        at += 7 + length
+        data += content[at - length : at]
+        if kind in (1, 4):  # whole, or the last part of one
+            yield Record.FromString(data)
+            data = b""
 
 
-@pytest.mark.usefixtures("own_folder")
-@pytest.mark.pictures
-def test_a_run_that_goes_on_is_the_same_at_weights_and_biases(train, monkeypatch) -> None:
-    """With the package itself, where it is installed."""
-    pytest.importorskip("wandb")
+@pytest.fixture
+def offline(own_folder: None, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The package itself, where it is installed, without a network."""
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
+    return pytest.importorskip("wandb")
+
+
+def test_a_run_of_the_callers_own_at_weights_and_biases_goes_on(offline: Any) -> None:
+    own = offline.init(project="own")
+    little = {"logger": {"type": "wandb"}, "solver": {"ppo": {"horizon": 5, "epochs": 1}}}
+    for seed in (0, 1):
+        task = proposer_rl.tasks.maze()
+        folder = Path(f"run_{seed}")
+        options = {"scale": "smoke", "updates": 1, "seed": seed, "settings": little}
+        proposer_rl.train(task, "target", folder=folder, progress=False, **options)
+        assert offline.run is own and own.id != (folder / "wandb_id.txt").read_text()
+        own.log({"seed": seed})
+    own.finish()
+    (folder,) = Path("wandb").glob("offline-run-*")
+    assert sum(record.HasField("history") for record in records(folder)) == 2
+
+
+@pytest.mark.usefixtures("offline")
+def test_a_run_that_goes_on_is_the_same_at_weights_and_biases(train) -> None:
     for updates in (4, 6):
         assert train(*SMOKE, "logger=wandb", "seed=3", f"schedule.updates={updates}") == 0
     folders = sorted(Path("run/wandb").glob("offline-run-*"), key=lambda one: one.stat().st_mtime)
     assert len(folders) == 2
-    steps: list[int] = []
+    steps: list[list[int]] = []
     for folder in folders:
         found = list(records(folder))
         (run,) = (record.run for record in found if record.HasField("run"))
@@ -179,10 +189,8 @@ def test_a_run_that_goes_on_is_the_same_at_weights_and_biases(train, monkeypatch
             {"/".join(item.nested_key) or item.key: json.loads(item.value_json) for item in h.item}
             for h in (record.history for record in found if record.HasField("history"))
         ]
-        steps += [row["_step"] for row in rows]
+        steps.append([row["_step"] for row in rows])
         for row in rows:
             assert "metrics/id_success" in row
-            trained = {"training/loss_critic", "curriculum/levels/path"} <= row.keys()
-            assert trained == (row["_step"] > 0)
-        assert "run/path" in rows[-1]
-    assert steps == [0, 2, 4, 6]
+            assert ("training/loss_critic" in row) == (row["_step"] > 0)
+    assert steps == [[0, 2, 4], [4, 6]]  # of a step that is there the first row stays

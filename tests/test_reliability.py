@@ -7,15 +7,19 @@ import os
 import re
 import shlex
 import shutil
+import subprocess
+import sys
+import time
 from pathlib import Path
-from signal import SIGINT, SIGKILL, SIGTERM, SIGUSR1
+from signal import SIGHUP, SIGINT, SIGKILL, SIGTERM, SIGUSR1
+from typing import Any
 
 import pytest
 
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.process import locked
 from tests.commands import SMOKE
-from tests.processes import Ended, Processes
+from tests.processes import ROOT, Ended, Processes
 from tests.same_run import assert_same_run
 
 FEW = [*SMOKE, "schedule.updates=4"]
@@ -72,6 +76,76 @@ def test_a_signal_saves_and_ends_and_the_same_command_goes_on(
     assert latest is not None and latest[1]["updates"] == 2
     assert processes(*command).code == 0
     assert_same_run(whole[0], tmp_path / "run")
+
+
+LOST = {  # how the output is lost, a signal, the exit code
+    "terminal": ({"terminal": True}, None, 128 + SIGHUP),
+    "terminal of a disowned run": ({"terminal": True, "ignored": [SIGHUP]}, None, 0),
+    "pipe": ({}, None, 0),
+    "pipe, Ctrl-C": ({}, SIGINT, 128 + SIGINT),
+    "pipe, SIGTERM": ({}, SIGTERM, 128 + SIGTERM),
+    "pipe, SIGUSR1": ({}, SIGUSR1, 128 + SIGUSR1),
+}
+
+
+@pytest.mark.parametrize(("how", "signum", "code"), LOST.values(), ids=LOST)
+def test_output_that_nobody_reads_any_more_ends_no_run(
+    how: dict[str, Any],
+    signum: int | None,
+    code: int,
+    whole: tuple[Path, Ended],
+    processes: Processes,
+    tmp_path: Path,
+) -> None:
+    """Terminals that close and readers of pipes that die: skypilot-org/skypilot#1169, SparK#19."""
+    command = [*TRAIN, "compute.progress=true", f"hydra.run.dir={tmp_path / 'run'}"]
+    row = nth(whole[1].writes, ROW, 1)
+    signal_at = {} if signum is None else {row + 1: int(signum)}
+    ended = processes(*command, lost_at=row, signal_at=signal_at, **how)
+    assert ended.code == code
+    latest = load_latest(tmp_path / "run" / "checkpoints")
+    assert latest is not None and latest[1]["updates"] == (2 if code else 4)
+    assert (tmp_path / "run" / "summary.json").exists() == (code == 0)
+    assert processes(*command).code == 0
+    assert_same_run(whole[0], tmp_path / "run")
+
+
+def test_a_disowned_sweep_whose_terminal_closes_finishes_its_runs(
+    whole: tuple[Path, Ended], processes: Processes, tmp_path: Path
+) -> None:
+    sweep = [
+        "-m",
+        *TRAIN,
+        "seed=0,1,2",
+        f"hydra.sweep.dir={tmp_path}",
+        "hydra.sweep.subdir=${seed}",
+    ]
+    row = nth(whole[1].writes, ROW, 1)
+    ended = processes(*sweep, lost_at=row, terminal=True, ignored=[SIGHUP])
+    assert ended.code == 0
+    assert len(list(tmp_path.glob("*/summary.json"))) == 3
+    assert not list(tmp_path.glob("*/error.json"))
+    assert_same_run(whole[0], tmp_path / "0")
+
+
+def test_ctrl_c_at_a_pipeline_with_tee_saves(whole: tuple[Path, Ended], tmp_path: Path) -> None:
+    """A real one, whose interpreters come to their own ends: Ctrl-C goes to the whole group."""
+    command = [sys.executable, "-m", "proposer_rl.cli.start", *TRAIN, "schedule.updates=100000"]
+    line = f"{shlex.join(command)} hydra.run.dir=run 2>&1 | tee log; exit ${{PIPESTATUS[0]}}"
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    bash = ["bash", "-c", f"trap : INT; {line}"]
+    pipeline = subprocess.Popen(bash, cwd=tmp_path, env=environment, start_new_session=True)
+    metrics = tmp_path / "run" / "metrics.csv"
+    while pipeline.poll() is None and not (metrics.exists() and metrics.stat().st_size > 1000):
+        time.sleep(0.05)
+    os.killpg(pipeline.pid, SIGINT)
+    assert pipeline.wait() == 128 + SIGINT
+    assert load_latest(tmp_path / "run" / "checkpoints") is not None
+    line = f"{shlex.join(command[:-1])} schedule.updates=1 hydra.run.dir=one | true"
+    closed = subprocess.run(
+        ["bash", "-c", f"{line}; exit ${{PIPESTATUS[0]}}"], cwd=tmp_path, env=environment
+    )
+    assert closed.returncode == 0 and (tmp_path / "one" / "summary.json").exists()
 
 
 def test_a_signal_in_the_proposers_episode_ends_it_and_it_is_played_again(

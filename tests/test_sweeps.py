@@ -7,14 +7,19 @@ import json
 import signal
 from functools import partial
 from pathlib import Path
+from typing import Any, ClassVar
 
 import pytest
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.experimental.callback import Callback
 from omegaconf import OmegaConf
 from submitit.core.utils import UncompletedJobError
 
 from proposer_rl.cli.config import RunConfig
-from proposer_rl.cli.train import main
+from proposer_rl.cli.errors import ConfigError
+from proposer_rl.cli.groups import settings_name
+from proposer_rl.cli.train import FailedRunError, main
 from proposer_rl.experiment import Experiment
 from proposer_rl.recipes import CONFIG_FOLDER, available, file_content
 from proposer_rl.runs.folder import read_csv, read_jsonl
@@ -144,7 +149,7 @@ def test_a_failed_run_is_listed_and_tried_again(
         patch.setattr(Experiment, "run", failing)
         assert train(*sweep) == 1
     printed = capsys.readouterr()
-    assert "failed: 0_target_seed_0: the disk is on fire" in printed.out
+    assert "the disk is on fire" in printed.out
     assert "2 runs: 1 finished, 1 failed" in printed.out
     assert "Traceback" in printed.err and "error: the disk is on fire" in printed.err
     assert train("-m", "+method=hand_designed", "seed=0,1", *FEW, "hydra.sweep.dir=all") == 0
@@ -156,14 +161,96 @@ def test_a_failed_run_is_listed_and_tried_again(
 
 def test_a_run_that_another_process_works_on_has_not_failed(train, capsys) -> None:
     sweep = ["-m", "+method=target", "seed=0,1", *FEW, "hydra.sweep.dir=all"]
-    taken = Path("all", "1_target_seed_1")
-    taken.mkdir(parents=True)
+    assert train(*sweep) == 0
+    (taken,) = Path("all").glob("target_*_seed_1")
+    (taken / "summary.json").unlink()
     with locked(taken):
         assert train(*sweep) == 0
-    assert "1_target_seed_1 is in use by process" in capsys.readouterr().err
+    assert f"{taken.name} is in use by process" in capsys.readouterr().err
     assert not list(Path("all").rglob("error.json"))
     assert train(*sweep) == 0
     assert "2 runs: 2 finished" in capsys.readouterr().out
+
+
+def test_a_sweep_of_more_finds_the_runs_that_are_finished(train, capsys) -> None:
+    """Hydra numbers the jobs of a grid with a value in front anew (hydra#1407, #3328)."""
+    sweep = ["-m", "+method=target", *FEW, "hydra.sweep.dir=all"]
+    assert train(*sweep, "seed=0", "+filter=none") == 0
+    before = states(Path("all"))
+    capsys.readouterr()
+    assert train(*sweep, "+filter=learnability,none", "seed=0") == 0
+    assert len(before) == 1 and before.items() < states(Path("all")).items()
+    said = capsys.readouterr().out
+    assert said.count("finished before") == 1 and "2 runs: 2 finished" in said
+    assert not list(Path("all").rglob("error.json"))
+
+
+def test_a_method_with_and_without_its_ablation_in_any_order(composed) -> None:
+    arguments = ["-m", "+ablation=none,paper_literal", "+method=perf_gain", "+scale=smoke"]
+    made = composed(*arguments, "hydra.sweep.dir=all")
+    assert {ablation for _, _, ablation, _ in made} == {"none", "paper_literal"}
+    names = sorted(folder.name for folder in Path("all").iterdir() if folder.is_dir())
+    known = [f"perf_gain_ablation={name},scale=smoke_seed_0" for name in ("none", "paper_literal")]
+    assert names == known
+
+
+@pytest.mark.parametrize(
+    ("overrides", "name"),
+    [
+        (["+method=plr", "seed=1"], ""),
+        (["+method=plr", "compute.device=cpu", "logger=wandb", "+sweep=quick"], ""),
+        (["seeds=[0,1]", "+scale=quick", "+as=dcd"], "as=dcd,scale=quick"),
+        (["solver.ppo.gamma=0.9", "pool.keep=8"], "pool.keep=8,solver.ppo.gamma=0.9"),
+    ],
+)
+def test_settings_name_a_folder(overrides: list[str], name: str) -> None:
+    assert settings_name(OmegaConf.create(overrides)) == name
+
+
+def test_settings_whose_names_no_folder_can_have_stay_apart() -> None:
+    values = ["task=arena/hill", "task=arena-hill", "x=[1,2]", "x=[1-2]", "y=" + "a" * 999]
+    names = [settings_name(OmegaConf.create([value])) for value in [*values, values[-1] + "b"]]
+    assert len(set(names)) == len(names)
+    assert all("/" not in name and len(name) < 150 for name in names)
+
+
+class Noted(Callback):
+    """What Hydra's launchers give to sweepers."""
+
+    seen: ClassVar[list[JobReturn]] = []
+
+    def on_job_end(self, config: Any, job_return: JobReturn, **_: Any) -> None:
+        """Notes how a run ended."""
+        self.seen.append(job_return)
+
+
+def test_sweepers_see_which_runs_failed(train) -> None:
+    """Optuna's counts failures up to max_failure_rate; a value of NaN would end its study."""
+    Noted.seen.clear()
+    watched = f"+hydra.callbacks.noted._target_={__name__}.Noted"
+    assert train("-m", "+method=target", "solver.batch_size=0,4", *FEW, watched) == 2
+    failed, made = Noted.seen
+    assert (failed.status, made.status) == (JobStatus.FAILED, JobStatus.COMPLETED)
+    with pytest.raises(FailedRunError, match=r"^solver\.batch_size=0: ") as raised:
+        _ = failed.return_value
+    assert raised.value.__context__ is None  # its frames would hold the run's memory
+    assert 0 <= made.return_value <= 1
+
+
+def test_a_folder_below_the_home_folder(train, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(home := Path("home dir").absolute()))
+    monkeypatch.setattr("proposer_rl.cli.run.parts", stopped)
+    runs = {"hydra.run.dir=~/a": "a", "hydra.run.dir='~/b'": "b"}
+    for word, name in runs.items():
+        assert train("+method=target", word) == 2
+        assert (home / name).is_dir()
+    assert train("-m", "+method=target", "seed=0,1", "hydra.sweep.dir='~/c'") == 2
+    assert len(list((home / "c").glob("*_seed_*"))) == 2
+    assert not Path("~").exists()
+
+
+def stopped(*_: object) -> None:
+    raise ConfigError("enough")
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from proposer_rl.learning import PPO, SolverSettings
 from proposer_rl.meta.replicas import shares
 from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.methods import Components, ProposerError, Workers, filtered, make, modelled
-from proposer_rl.models import available_cores, own_state, use_device
+from proposer_rl.models import available_cores, check_torch_defaults, use_device
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.process import Status, StopSignals, memory
 from proposer_rl.streams import Streams
@@ -79,18 +79,15 @@ def make_task(config: RunConfig) -> Task:
     context = ComputeContext(
         device, config.precision, compute.cores, compute.graphs, compute.compile
     )
+    check_torch_defaults()
     with key("task", "task."):
         task: Task = _made(task_maker(config.task), config.solver, context, str(device))
+    check_torch_defaults()  # an environment's module may have set them as it was imported
     if task.device.type != device.type:
         warnings.warn(
             f"this run is computed on {task.device.type} instead of {device.type}, since that is "
             "where the task makes its levels",
             stacklevel=2,
-        )
-    if compute.compile and task.device.type != "cuda":
-        raise ConfigError(
-            "compute.compile=True: compiles for a GPU, and this run is computed on "
-            f"{task.device.type}; leave False"
         )
     return task
 
@@ -113,8 +110,7 @@ def _check_memory(learner: PPO) -> None:
 def _made(maker: partial[Any], solver: SolverSettings, context: ComputeContext, device: str) -> Any:
     """Returns the task on a device; workers call it, too."""
     use_device(torch.device(device))
-    with own_state():  # also after whatever a module of one's own sets as it is imported
-        return maker(solver=solver, context=context._replace(device=torch.device(device)))
+    return maker(solver=solver, context=context._replace(device=torch.device(device)))
 
 
 def _curriculum(
@@ -154,17 +150,6 @@ def _curriculum(
 def _workers(config: RunConfig, task: Task) -> Workers | None:
     """Returns where the replicas are trained; None for this process."""
     compute, copies = config.compute, config.proposer.rollouts
-    if compute.collector == "single":
-        for name in ("workers", "worker_devices"):
-            if getattr(compute, name) is not None:
-                raise ConfigError(
-                    f"compute.{name}={getattr(compute, name)}: there are workers only with "
-                    "compute.collector=multiprocess or ray"
-                )
-    if compute.collector != "ray" and compute.ray_address is not None:
-        raise ConfigError(
-            f"compute.ray_address={compute.ray_address}: is of use only with compute.collector=ray"
-        )
     if compute.collector == "single":
         return None
     if compute.collector == "ray" and find_spec("ray") is None:

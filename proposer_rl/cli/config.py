@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import json
-import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -19,8 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from proposer_rl.cli.errors import ConfigError, one_line, settings_file
-from proposer_rl.cli.groups import unquoted
 from proposer_rl.experiment import ScheduleSettings
+from proposer_rl.extras import where_to_look
 from proposer_rl.learning import SolverSettings
 from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.runs.folder import read_bounded
@@ -193,8 +192,6 @@ def task_maker(values: Mapping[str, Any]) -> partial[Any]:
     """Returns a function that makes the task of these settings from ``solver`` and ``context``."""
     target = f"task._target_={values.get('_target_')}"
     make, own = located("task", values)
-    for missing in set(GIVEN_TO_TASKS) - {*inspect.signature(make).parameters}:
-        raise ConfigError(f"{target}: makes no task: it takes no argument {missing!r}")
     with key("task", f"{target}: ", CANNOT_BE_CALLED):
         return partial(make, **arguments(make, own, GIVEN_TO_TASKS))
 
@@ -208,9 +205,10 @@ def located(name: str, values: Mapping[str, Any]) -> tuple[Callable[..., Any], d
         made = instantiate({**values, "_partial_": True}, _convert_="all")
         inspect.signature(made.func)
     except (HydraException, ImportError, AttributeError, TypeError, ValueError) as error:
-        inner = re.search(r"full_key: (\w+?)\W*\d*\W*$", str(error))  # of a list the place, too
-        wrong = f"{name}.{inner[1]}" if inner else f"{name}._target_={target}"
-        raise ConfigError(f"{wrong}: {_why_not_found(error)}") from error
+        cause: BaseException = error
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
+        raise ConfigError(f"{name}: {one_line(cause)}{where_to_look(cause)}") from error
     return made.func, made.keywords
 
 
@@ -239,21 +237,6 @@ def stored_config(file: Path) -> Any:
         raise ConfigError(f"{file}: is no JSON of at most {LARGEST_FILE:,} bytes") from None
 
 
-def _why_not_found(error: BaseException) -> str:
-    """Returns one line on why a ``_target_`` cannot be imported."""
-    line = re.split(r", set env var HYDRA_FULL_ERROR|\s*full_key: ", one_line(error))[0]
-    innermost = error
-    while innermost.__cause__ is not None:
-        innermost = innermost.__cause__
-    if innermost is error or not isinstance(innermost, ImportError):
-        return line
-    line = f"{line}: {one_line(innermost)}"
-    # With a dot in its name, what holds the module was found.
-    if not isinstance(innermost, ModuleNotFoundError) or "." in str(innermost.name):
-        return line
-    return f"{line}; if it is your own, name its folder, as in PYTHONPATH=. bin/train ..."
-
-
 def _resolved(config: DictConfig) -> Any:
     """Returns plain values, with references replaced by what they refer to."""
     try:
@@ -275,8 +258,6 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Yields every value that is no mapping or list, with its dotted key."""
     if isinstance(value, dict | list):
         for part, inner in value.items() if isinstance(value, dict) else enumerate(value):
-            if isinstance(part, bool):
-                raise ConfigError(unquoted(name, part))
             yield from _leaves(inner, f"{name}.{part}" if name else str(part))
     else:
         yield name, value

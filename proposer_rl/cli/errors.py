@@ -13,10 +13,11 @@ import math
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from io import TextIOWrapper
 from pathlib import Path
 from signal import SIGINT
 from typing import NoReturn, TypeVar
+
+from proposer_rl.runs.process import Output, guard_output
 
 BAD_INPUT = 2
 STORAGE = 4
@@ -33,43 +34,41 @@ class ConfigError(ValueError):
 
 def command(body: Callable[[], None]) -> None:
     """Runs the body of a command; a foreseen error ends it with one line and its exit code."""
-    print_all_signs()
+    guard_output()
     try:
         body()
     except KeyboardInterrupt:
         sys.exit(SIGNALLED + SIGINT)
     except Exception as error:
-        if exit_code(error) == UNFORESEEN:
-            raise
         refuse(error)
 
 
-def print_all_signs() -> None:
-    """Makes standard output print ``?`` for characters that its encoding does not have."""
-    if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
-        sys.stdout.reconfigure(errors="replace")
-
-
 def say(text: str) -> None:
-    """Prints a text on standard output, with ``?`` for characters that its encoding lacks."""
+    """Prints a text on standard output, above progress bars; it never raises."""
     from tqdm import tqdm
 
-    encoding = sys.stdout.encoding or "utf-8"
-    tqdm.write(text.encode(encoding, "replace").decode(encoding))
+    tqdm.write(text, file=Output(sys.stdout))
 
 
 def refuse(error: Exception, folder: Path | None = None) -> NoReturn:
-    """Prints an error in one line, as :func:`one_line` does, and exits with its code."""
+    """Prints an error in one line, as :func:`one_line` does, and exits with its code.
+
+    Raises:
+        Exception: the error itself, if it was not foreseen.
+    """
+    code = exit_code(error)
+    if code == UNFORESEEN:
+        raise error
     print(f"error: {one_line(error, folder)}", file=sys.stderr)
-    sys.exit(exit_code(error))
+    sys.exit(code)
 
 
 def exit_code(error: BaseException) -> int:
-    """Returns the exit code of an error."""
+    """Returns the exit code of an error; a lost connection is no error of the disk."""
     if lacks_memory(error):
         return BAD_INPUT
-    storage = STORAGE if isinstance(error, OSError) else UNFORESEEN
-    return int(getattr(error, "exit_code", storage))
+    storage = isinstance(error, OSError) and not isinstance(error, ConnectionError)
+    return int(getattr(error, "exit_code", STORAGE if storage else UNFORESEEN))
 
 
 def lacks_memory(error: BaseException) -> bool:

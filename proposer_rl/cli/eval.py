@@ -19,7 +19,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(options: argparse.Namespace) -> None:
     check_file("output", options.output, ".json", ".csv")
-    check_file("pictures", options.pictures, ".png")
     from proposer_rl.cli.evaluate import list_levels
 
     try:
@@ -53,9 +52,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "-o", "--output", type=Path, help="a file for the rows that ends in .json or .csv"
-    )
-    parser.add_argument(
-        "--pictures", type=Path, help="a file that ends in .png for the levels with the paths taken"
     )
     return parser
 

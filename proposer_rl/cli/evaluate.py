@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from proposer_rl.cli.stored import Stage, StoredRun, stored_run, write_rows
-from proposer_rl.models import own_state
 from proposer_rl.report.tables import to_csv
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.task import LevelResult
 
-SHOWN = 36  # levels in the table and on the sheet of pictures
-COLUMNS, SIDE = 6, 1.9  # of the sheet, in levels and in inches
+SHOWN = 36  # levels in the table
 
 
 class Evaluation(NamedTuple):
@@ -58,8 +54,6 @@ def list_levels(options: argparse.Namespace) -> None:
         write_atomically(options.output, table.encode())
     else:
         write_rows(evaluation.rows(), options.output)
-    if options.pictures is not None:
-        write_atomically(options.pictures, _sheet(evaluation))
 
 
 def load(checkpoint: Path) -> tuple[StoredRun, Stage]:
@@ -68,7 +62,6 @@ def load(checkpoint: Path) -> tuple[StoredRun, Stage]:
     return run, run.stage(checkpoint if checkpoint.is_file() else None)
 
 
-@own_state()
 def evaluate(
     loaded: tuple[StoredRun, Stage], name: str | None, max_steps: int | None = None
 ) -> Evaluation:
@@ -124,25 +117,3 @@ def _means(results: Sequence[LevelResult]) -> list[str]:
     names = results[0].results
     means = {name: sum(each.results[name] for each in results) / len(results) for name in names}
     return [f"{m:.1%}" if "success" in name else f"{m:.3f}" for name, m in means.items()]
-
-
-def _sheet(evaluation: Evaluation) -> bytes:
-    """Returns pictures of the first Solver on the hardest levels side by side, a PNG file."""
-    shown = _hardest([each for each in evaluation.results if each.solver == 0])
-    columns = min(COLUMNS, len(shown))
-    rows = -(-len(shown) // columns)
-    figure = Figure(figsize=(max(SIDE * columns, 5), (SIDE + 0.45) * rows + 0.7), layout="tight")
-    # Names come from files: a dollar sign in one is no formula.
-    title = f"{evaluation.run.folder.name}, {evaluation.updates} updates"
-    figure.suptitle(title, fontsize=9, parse_math=False)
-    grid = figure.subplots(rows, columns, squeeze=False)
-    for axes in grid.flat:
-        axes.set_axis_off()
-    for axes, (level, *_) in zip(grid.flat, shown, strict=False):
-        axes.imshow(level.picture())
-        result = level.results.get("success", level.results["return"])
-        caption = f"{level.level}: {result:.3g}\n{level.note}"
-        axes.set_title(caption, fontsize=7, parse_math=False)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=110)
-    return file.getvalue()

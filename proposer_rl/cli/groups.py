@@ -1,37 +1,149 @@
-"""What is wrong with a command that Hydra composes, or cannot compose, in one line."""
+"""What a command asks for: its overrides, its groups, and errors in composing them."""
 
 from __future__ import annotations
 
 import codecs
+import hashlib
+import os
 import re
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import yaml
-from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import (
-    ConfigAttributeError,
-    ConfigKeyError,
-    KeyValidationError,
-    OmegaConfBaseException,
-)
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
 from proposer_rl.cli.errors import ConfigError, one_line
-from proposer_rl.cli.help import GROUPS, own_folders
-from proposer_rl.extras import install_command
-from proposer_rl.recipes import available, yaml_file
+from proposer_rl.cli.help import GROUPS
+from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, available, file_content, override, yaml_file
 
-# Of these nothing is chosen until a command does.
-ADDED = [group.strip("+=") for group in GROUPS if group.startswith("+")]
-# And these change a method or a scale, which therefore come before them.
-CHANGING = [f"+{group}" for group in ADDED if group not in ("method", "scale", "sweep")]
+# Files that change a method or a scale, and must come after it, since later files win.
+CHANGED = ("method", "scale")
+CHANGING = [group.strip("+=") for group in GROUPS if group.startswith("+")]
+CHANGING = [group for group in CHANGING if group not in (*CHANGED, "sweep")]
+# The files that stand for null, which Hydra does not take for a group.
+NOTHING = {"filter": "none", "ablation": "none", "logger": "csv"}
+# What a sweep's folders are not named after: where a run is computed and shown, and what has a
+# place of its own in the name.
+UNNAMED = {"compute", "logger", "method", "seed", "seeds", "sweep"}
+LONGEST = 120  # characters of a name that come from overrides
 
-LAUNCHERS = [f"hydra/launcher/{name}" for name in ("joblib", "submitit_local", "submitit_slurm")]
-_NOT_CHOSEN = re.compile(r"Could not override '(\w+)'\. No match in the defaults list")
+
+class Invocation(NamedTuple):
+    """How a run was asked for; fixed when its configuration is composed.
+
+    Attributes:
+        folder: the run's, absolute.
+        overrides: as on the command line, with the run's interpolations unresolved.
+        config_dir: given with ``--config-dir``; relative if it lies in the working folder.
+        python_path: the caller's, without the checkout, which ``bin/`` adds.
+    """
+
+    folder: Path
+    overrides: list[str]
+    config_dir: str | None = None
+    python_path: str | None = None
+
+
+def invocation(hydra: Any, overrides: Sequence[str], folder: Path) -> Invocation:
+    """Returns how a run is asked for, from Hydra's configuration of it."""
+    given = [s.path for s in hydra.runtime.config_sources if s.provider == "command-line"]
+    own = str(PACKAGE.parent)
+    paths = [part for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part]
+    return Invocation(
+        folder.expanduser().absolute(),
+        list(overrides),
+        config_dir=next(map(_from_here, given), None),
+        python_path=os.pathsep.join(_from_here(part) for part in paths if part != own) or None,
+    )
+
+
+def _from_here(path: str) -> str:
+    """Returns a path relative to the working folder if it lies inside, else unchanged."""
+    inside = Path(path).resolve()
+    here = Path.cwd().resolve()
+    return str(inside.relative_to(here)) if inside.is_relative_to(here) else path
+
+
+def given_overrides(hydra: Any) -> list[str]:
+    """Returns the overrides of a run, with its interpolations unresolved."""
+    given: Any = OmegaConf.to_container(hydra.overrides.task)
+    return list(given)
+
+
+def arranged(overrides: Sequence[str]) -> list[str]:
+    """Returns overrides in the order and spelling in which Hydra takes them.
+
+    Groups that change a method or a scale come after it. null for a group stands for its file that
+    changes nothing: ``logger=null`` is ``logger=csv``. A folder in the home folder may begin with
+    ``~``.
+
+    Raises:
+        ConfigError: if a group is set to what cannot be a file's name, such as ``task=null``.
+        OverrideParseException: if one is not in Hydra's grammar.
+    """
+    words = [_at_home(word) for word in overrides]
+    found = [_word(parsed) for parsed in OverridesParser.create().parse_overrides(words)]
+    if "filter=null" in overrides and not _filters(found):
+        found.remove(f"+filter={NOTHING['filter']}")  # which labels the run as changed
+    groups = [word.partition("=")[0].lstrip("+") for word in found]
+    end = max((place for place, group in enumerate(groups) if group in CHANGED), default=-1) + 1
+    early = {place for place in range(end) if groups[place] in CHANGING}
+    first = [word for place, word in enumerate(found[:end]) if place not in early]
+    return [*first, *(found[place] for place in sorted(early)), *found[end:]]
+
+
+def _at_home(word: str) -> str:
+    key, _, value = word.partition("=")
+    home = value.startswith("~") and key in ("hydra.run.dir", "hydra.sweep.dir")
+    return override(key, Path(value).expanduser()) if home else word
+
+
+def _filters(overrides: Sequence[str]) -> bool:
+    """Returns whether one of the methods has a filter of its own; True if none is named here."""
+    names = [word.partition("=")[2] for word in overrides if word.startswith("+method=")]
+    known = [name for name in ",".join(names).split(",") if name in available("method")]
+    return not known or any(file_content(f"method/{name}").get("filter") for name in known)
+
+
+def _word(parsed: Override) -> str:
+    """Returns an override as Hydra takes it, see :func:`arranged`."""
+    word, group = str(parsed.input_line), parsed.key_or_group
+    value: Any = parsed.value()
+    values = value.list if parsed.is_choice_sweep() else [value]
+    if parsed.is_delete() or not (CONFIG_FOLDER / group).is_dir():
+        return word
+    if None in values and group in NOTHING:
+        names = [name.strip() for name in word.partition("=")[2].split(",")]
+        names = [NOTHING[group] if name.lower() == "null" else name for name in names]
+        return f"{'' if group == 'logger' else '+'}{group}={','.join(names)}"
+    if any(value is None or isinstance(value, int | float) for value in values):
+        choices = ", ".join(available(group))
+        raise ConfigError(f"{word}: names no file; choose one of: {choices}")
+    return word
+
+
+def settings_name(overrides: ListConfig) -> str:
+    """Returns what the folder of a run in a sweep is called after: the settings that were given.
+
+    It depends on neither their order nor on what else is in the sweep. Behind a name that is cut,
+    or whose signs no folder can have, stands a digest of the whole.
+
+    Example:
+        >>> settings_name(OmegaConf.create(["+method=plr", "seed=1", "+scale=quick", "x.y=8"]))
+        'scale=quick,x.y=8'
+    """
+    given: Any = OmegaConf.to_container(overrides)
+    words = [word.lstrip("+") for word in given]
+    named = [word for word in words if re.split(r"[.=]", word)[0] not in UNNAMED]
+    whole = ",".join(sorted(named))
+    name = re.sub(r"[^\w.=,+~-]", "-", whole)[:LONGEST]
+    digest = hashlib.sha256(whole.encode()).hexdigest()[:8]
+    return name if name == whole else f"{name}-{digest}"
+
 
 # ${joined:${seeds}} in the configuration: 0, or 0-1-2 where seeds are trained together.
 OmegaConf.register_new_resolver(
@@ -40,16 +152,15 @@ OmegaConf.register_new_resolver(
     lambda items: "-".join(map(str, items)) if isinstance(items, ListConfig) else str(items),
     replace=True,
 )
-
-
-def overrides() -> list[str]:
-    """Returns the overrides of the command line, with the run's interpolations unresolved."""
-    given: Any = OmegaConf.to_container(HydraConfig.get().overrides.task)
-    return list(given)
+OmegaConf.register_new_resolver(
+    "settings",
+    lambda overrides: f"{name}_" if (name := settings_name(overrides)) else "",
+    replace=True,
+)
 
 
 def check_groups(given: Sequence[str]) -> None:
-    """Refuses groups that would undo each other, since later ones win, or that do not fit."""
+    """Refuses a scale of another task, and groups that would be undone, since later ones win."""
     said = dict(override.split("=", 1) for override in given if "=" in override)
     task, scale = said.get("task"), said.get("+scale")
     if task in available("task") and scale in available("scale"):
@@ -59,16 +170,13 @@ def check_groups(given: Sequence[str]) -> None:
             raise ConfigError(
                 f"+scale={scale}: is of task={scaled}; task={task} has numbers of its own"
             )
-    groups = [override.partition("=")[0] for override in given]
-    changing = [place for place, group in enumerate(groups) if group in CHANGING]
-    for group in groups[min(changing, default=len(groups)) :]:
-        if group in ("+method", "+scale"):
-            raise ConfigError(
-                f"{group}: must come before {groups[changing[0]]}, or it would undo it"
-            )
+    if arranged(given) != [*given]:  # a sweep's file has its own order
+        raise ConfigError(
+            f"{' '.join(given)}: +method and +scale must come before what changes them"
+        )
 
 
-def check_chosen(config: DictConfig) -> None:
+def check_chosen(config: DictConfig, hydra: Any) -> None:
     """Refuses a run without a method, and a file that Hydra has put below its group.
 
     It does so with a file of one's own for want of its first line.
@@ -76,11 +184,11 @@ def check_chosen(config: DictConfig) -> None:
     if config.method is None or config.curriculum is None:
         known = ", ".join(available("method"))
         raise ConfigError(f"method: missing; choose one with +method=NAME, NAME one of: {known}")
-    for group, name in HydraConfig.get().runtime.choices.items():
+    for group, name in hydra.runtime.choices.items():
         below = config.get(group)
         if not isinstance(below, DictConfig) or group not in below:
             continue
-        folders = (Path(source.path) for source in HydraConfig.get().runtime.config_sources)
+        folders = (Path(source.path) for source in hydra.runtime.config_sources)
         files = [folder / group / f"{name}.yaml" for folder in folders]
         file = next((file for file in files if file.is_file()), files[0])
         marked = file.is_file() and file.read_bytes().startswith(codecs.BOM_UTF8)
@@ -92,76 +200,15 @@ def check_chosen(config: DictConfig) -> None:
 
 
 def explained(error: Exception) -> str:
-    """Returns one line on an error from composing a configuration."""
-    if isinstance(error, UnicodeDecodeError):
-        return _not_utf8(error)
-    if isinstance(error, MissingConfigException):
-        return _no_such_file(error)
-    cause = error.__cause__
-    if isinstance(cause, ConfigAttributeError | ConfigKeyError):
-        return _no_such_key(cause)
-    if isinstance(cause, KeyValidationError):
-        return unquoted(cause.full_key or "a file", cause.key)
-    if "DictConfig with ListConfig" in f"{error} {cause}":
-        return _no_mapping(error)
-    not_chosen = _NOT_CHOSEN.match(str(error))
-    if not_chosen and not_chosen[1] in ADDED:
-        group, known = not_chosen[1], ", ".join(available(not_chosen[1]))
-        return f"{group}: choose one with +{group}=NAME, NAME one of: {known}"
+    """Returns one line on an error in composing: an unknown file or key with those that exist."""
+    if isinstance(error, MissingConfigException) and error.options:
+        return f"{error.missing_cfg_file}: unknown; choose one of: {', '.join(error.options)}"
     if isinstance(error, OverrideParseException):
-        said = one_line(error).partition(" See https:")[0]
-        return (
-            f"{error.override}: cannot be read as KEY=VALUE ({said}); a value with other signs "
-            "than letters, digits and /:-+.$%*@?|_ has quotes of its own: \"KEY='VALUE'\""
-        )
-    return one_line(error)
-
-
-def unquoted(place: str, read: object) -> str:
-    """Returns one line on a name that YAML takes for one of its constants."""
-    words = {True: "on, yes or true", False: "off, no or false", None: "null or ~"}
-    name = f"{words[read]} without quotes" if read in words else repr(read)
-    return f'{place}: {name} is no name here; a name has quotes, as in "on":'
-
-
-def _no_mapping(error: Exception) -> str:
-    """Returns one line that says where the list is that should be a mapping."""
-    said, *_ = str(error).splitlines()
-    name, *_ = said.removeprefix("Error merging override ").split(": Config")
-    name = name.removeprefix("In '").removesuffix("'")
-    files = (folder / f"{name}.yaml" for folder in own_folders(sys.argv))
-    read = (yaml.safe_load(file.read_bytes()) for file in files if file.is_file())
-    lists = [key for content in read for key in _lists(content)]
-    named = f" (it has lists in {', '.join(lists)})" if lists else ""
-    return f"{name}: a list where there must be a mapping, {{NAME: VALUE}}{named}"
-
-
-def _lists(node: Any, place: str = "") -> Iterator[str]:
-    for key, value in node.items() if isinstance(node, dict) else ():
-        here = f"{place}.{key}" if place else str(key)
-        if isinstance(value, list) and here != "defaults":
-            yield here
-        yield from _lists(value, here)
-
-
-def _not_utf8(error: UnicodeDecodeError) -> str:
-    """Returns one line that names the file, searched in the folders that the command names."""
-    files = (file for folder in own_folders(sys.argv) for file in sorted(folder.rglob("*.yaml")))
-    named = [f"{file}: " for file in files if file.read_bytes().startswith(error.object)]
-    return f"{''.join(named[:1])}is not encoded in UTF-8; save it so ({one_line(error)})"
-
-
-def _no_such_file(error: MissingConfigException) -> str:
-    file = error.missing_cfg_file
-    if file in LAUNCHERS:
-        return f"{file}: its package is missing; install it with: {install_command('launchers')}"
-    known = f"; choose one of: {', '.join(error.options)}" if error.options else ""
-    return f"{file}: unknown{known}"
-
-
-def _no_such_key(error: OmegaConfBaseException) -> str:
-    holder = error.parent_node
-    if not isinstance(holder, DictConfig):
-        return one_line(error)
-    known = sorted(str(key) for key in holder if holder._get_full_key(key) != "hydra")
-    return f"{error.full_key}: unknown; there are: {', '.join(known) or 'none'}"
+        return f"{error.override}: {one_line(error)}"
+    cause: Any = error.__cause__
+    if isinstance(cause, ConfigAttributeError | ConfigKeyError):
+        holder = cause.parent_node
+        if isinstance(holder, DictConfig):
+            known = sorted(str(key) for key in holder if holder._get_full_key(key) != "hydra")
+            return f"{cause.full_key}: unknown; there are: {', '.join(known) or 'none'}"
+    return ": ".join(map(one_line, filter(None, (error, cause))))

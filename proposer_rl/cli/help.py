@@ -1,9 +1,10 @@
-"""``bin/train --help``: what there is to choose from, with the first line of each file."""
+"""``bin/train --help``: what there is to choose from."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from textwrap import fill
 
 from proposer_rl.recipes import CONFIG_FOLDER, available, comments
 
@@ -35,14 +36,14 @@ NEEDS, NOTHING = "Needs: ", "nothing."
 
 
 def help_text(arguments: Sequence[str]) -> str:
-    """Returns usage, the choices of each group, also of ``--config-dir``, and examples."""
+    """Returns usage, the names in each group, also of ``--config-dir``, and examples."""
     folders = [CONFIG_FOLDER, *own_folders(arguments)]
     parts = [USAGE]
     for option, meaning in GROUPS.items():
-        parts.append(f"{option} {meaning}")
-        lines = choices(option.strip("+="), folders).items()
-        parts += [f"  {name:24} {line}" for name, line in lines]
-        parts.append("")
+        group = option.strip("+=")
+        names = sorted({name for folder in folders for name in available(group, folder)})
+        listed = fill(", ".join(names), 79, initial_indent="  ", subsequent_indent="  ")
+        parts.append(f"{option} {meaning}\n{listed}\n")
     return "\n".join([*parts, EXAMPLES])
 
 

@@ -40,7 +40,6 @@ def _run(options: argparse.Namespace) -> None:
             f"bin/play needs {' and '.join(missing)}; install with: {install_command('play')}"
         )
     session = open_session(options.run)
-    from proposer_rl.models import own_state
     from proposer_rl.play.server import application, listen, server
 
     token = secrets.token_urlsafe()
@@ -48,7 +47,7 @@ def _run(options: argparse.Namespace) -> None:
         listening = listen(options.port)
     except OSError as error:
         raise ConfigError(f"--port {options.port}: {error.strerror}") from error
-    with own_state(), listening, suppress(KeyboardInterrupt):
+    with listening, suppress(KeyboardInterrupt):
         address = f"http://127.0.0.1:{listening.getsockname()[1]}/{token}/"
         print(f"Open {address} in a browser on this machine; Ctrl-C ends it.", flush=True)
         if options.open:
@@ -60,12 +59,10 @@ def _run(options: argparse.Namespace) -> None:
 def open_session(folder: Path) -> Session:
     """Returns the session that shows the run in a folder."""
     settings_file(folder)  # before what takes seconds to import
-    from proposer_rl.cli.config import saved_config
     from proposer_rl.cli.run import run_name
     from proposer_rl.cli.stored import stored_run
     from proposer_rl.play.session import Session
 
-    saved_config(folder)  # a folder that is no run's has no checkpoints either
     stored = stored_run(folder)
     return Session(
         folder=folder,

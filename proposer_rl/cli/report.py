@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from proposer_rl.cli.errors import ConfigError, command, number
+from proposer_rl.cli.errors import command, number
 from proposer_rl.cli.help import choices
 from proposer_rl.recipes import CONFIG_FOLDER
 
@@ -18,7 +18,7 @@ examples:
   bin/report a b c --threshold 0.5         three runs; sample efficiency at 50 %
   bin/report sweeps/quick --baseline target   everything measured against that method
   bin/report outputs results/medium        your runs beside published ones
-  bin/report plr.jsonl uniform.jsonl       logs of teachers, teacher.log(file), to teachers.html
+  bin/report plr.jsonl uniform.jsonl       logs of teachers, teacher.log(file)
 
 The output folder gets report.html (one self-contained page), report.md (the same in short),
 figures/ (SVG, PNG) and tables/ (CSV, Markdown, and all measurements as tidy CSV).
@@ -35,17 +35,8 @@ def _run(options: argparse.Namespace) -> None:
     from proposer_rl.report.reading import find_runs
     from proposer_rl.runs.records import printable
 
-    logs = [path for path in options.folder if path.suffix == ".jsonl"]
-    if logs:
-        if len(logs) < len(options.folder) or options.threshold is not None or options.baseline:
-            raise ConfigError(
-                f"{logs[0]}: is a teacher's log, reported without runs, --threshold and --baseline"
-            )
-        from proposer_rl.report.teachers import write_teachers
-
-        print(printable(f"Report: {write_teachers(options.folder, options.output)}"))
-        return
-    find_runs(options.folder)  # refuses what is none, before what takes seconds to import
+    # Refuses what is none, before what takes seconds to import.
+    find_runs([path for path in options.folder if path.suffix != ".jsonl"])
     from proposer_rl.report.build import write_report
 
     page = write_report(
@@ -70,7 +61,7 @@ def _parser() -> argparse.ArgumentParser:
         "folder",
         nargs="+",
         type=Path,
-        help="a run's folder, or one with runs in it at any depth; or logs of teachers",
+        help="a run's folder, or one with runs in it at any depth; a log of a teacher, *.jsonl",
     )
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("report"), help="where to write (default: report)"

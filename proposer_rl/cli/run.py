@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import shlex
@@ -10,34 +9,29 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from signal import Signals
 from typing import Any, Protocol
 
-import numpy as np
 import torch
-from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from numpy.typing import NDArray
-from PIL import Image
 
 from proposer_rl.cli.build import Made, build, parts
-from proposer_rl.cli.config import LARGEST_FILE, RunConfig, stored_config
+from proposer_rl.cli.config import RunConfig, stored_config
 from proposer_rl.cli.errors import ConfigError, one_line, say
-from proposer_rl.cli.groups import overrides
+from proposer_rl.cli.groups import Invocation
 from proposer_rl.cli.help import choices, needs
-from proposer_rl.cli.loggers import log_of, logger
+from proposer_rl.cli.loggers import logger
 from proposer_rl.experiment import Experiment
 from proposer_rl.learning import DivergedError
 from proposer_rl.meta.workers import WorkersError
-from proposer_rl.models import own_state
-from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, override_value
+from proposer_rl.recipes import CONFIG_FOLDER, override_value
 from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
-from proposer_rl.runs.folder import PROPOSER, RunFolder, read_bounded, storage, write_atomically
+from proposer_rl.runs.folder import PROPOSER, RunFolder, storage, write_atomically
 from proposer_rl.runs.process import Interrupted, Status, StopSignals, locked, processor
-from proposer_rl.runs.records import TaskFacts, checked
+from proposer_rl.runs.records import TaskFacts, checked, small_json
 
 SUMMARY = "summary.json"
 # What may differ: where it is computed and shown, and a longer schedule.
@@ -53,9 +47,6 @@ class Shown(Protocol):
     def draw_run(self, folder: Path, title: str) -> Path:
         """Draws the picture of a run that is over; returns its file."""
 
-    def last_map(self, folder: Path) -> NDArray[np.uint8] | None:
-        """Returns the heat map of the last proposals, uint8 [H, W, 3]; None without any."""
-
     def announce(
         self,
         method: str,
@@ -67,28 +58,28 @@ class Shown(Protocol):
         """Prints the results."""
 
 
-def train(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> float:
+def train(config: RunConfig, asked: Invocation, signals: StopSignals, shown: Shown) -> float:
     """Carries out a run for the command line; where it is stopped, says how it goes on, and exits.
 
     Returns:
         The headline measurement at the end, e.g. for a Hydra sweeper.
     """
     try:
-        return carry_out(config, path, signals, shown)
+        return carry_out(config, asked, signals, shown)
     except Interrupted as stop:
-        stopped = f"{one_line(stop).capitalize()}; all is saved"
-        say(f"{stopped}. To go on: {to_go_on(path)}")
+        name = Signals(stop.signum).name
+        say(f"Stopped by {name}; all is saved. To go on: {to_go_on(asked)}")
         if "SUBMITIT_EXECUTOR" in os.environ:  # the sweep that sent this job waits for its result
             raise
         sys.exit(stop.exit_code)
     except KeyboardInterrupt:
         stopped = "Stopped at once; what came after the last checkpoint is lost"
-        say(f"{stopped}. To go on: {to_go_on(path)}")
+        say(f"{stopped}. To go on: {to_go_on(asked)}")
         raise
 
 
-@own_state()
-def carry_out(config: RunConfig, path: Path, signals: StopSignals, shown: Shown) -> float:
+@torch.inference_mode(False)  # also where it is called without gradients
+def carry_out(config: RunConfig, asked: Invocation, signals: StopSignals, shown: Shown) -> float:
     """Makes the parts of an experiment, and runs it in a folder that it locks meanwhile.
 
     It is called inside the context of the signals that may ask the run to stop.
@@ -100,16 +91,19 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals, shown: Shown)
         Interrupted: if a signal asked the run to stop; all is saved then.
     """
     status = Status(config.proposer.meta_episode_length)
-    config = as_begun(config, path)
+    config = as_begun(config, asked.folder)
     made = parts(config, signals, status)  # whatever is wrong with the input is found here
     try:
         checked(TaskFacts, made.task.facts, "task")  # as the run's readers will at its end
     except ValueError as error:
         raise ConfigError(one_line(error)) from error
-    with locked(path):
+    with locked(asked.folder):
         try:
-            result = proceed(config, made, path, signals, status, shown)
+            result = proceed(config, made, asked, signals, status, shown)
             signals.deliver()  # of a sweep the next run is not to begin
+        except Interrupted as stop:
+            stop.folder = asked.folder
+            raise
         except WorkersError as error:
             raise WorkersError(f"compute.{error}") from error
         finally:
@@ -119,9 +113,15 @@ def carry_out(config: RunConfig, path: Path, signals: StopSignals, shown: Shown)
 
 
 def proceed(
-    config: RunConfig, made: Made, path: Path, signals: StopSignals, status: Status, shown: Shown
+    config: RunConfig,
+    made: Made,
+    asked: Invocation,
+    signals: StopSignals,
+    status: Status,
+    shown: Shown,
 ) -> dict[str, Any]:
     """Begins a run, resumes it, or says that it is finished; returns its summary."""
+    path = asked.folder
     folder = RunFolder(path)
     # What `auto` has become, so that a run goes on in the same precision elsewhere.
     precision: Any = made.task.precision
@@ -130,10 +130,9 @@ def proceed(
     if finished is not None:
         say(f"{run_name(config)}: finished before, nothing to do. Files: {path}")
         return finished
-    with logger(config.logger, path, run_name(config), asdict(config)) as write:
-        log = None if write is None else log_of(write, partial(shown.last_map, path))
+    with logger(config.logger, path, run_name(config), asdict(config)) as log:
         experiment = build(config, made, folder, signals, status, log)
-        facts = identity(experiment, config)
+        facts = identity(experiment, config, asked)
         described = {"planned_updates": config.schedule.updates, "task": made.task.facts}
         folder.write_json("run.json", {**facts, **described})
         try:
@@ -150,9 +149,6 @@ def proceed(
             write_atomically(path / PROPOSER, content)
         folder.write_json(SUMMARY, {**facts, **result})
         picture = shown.draw_run(path, run_name(config))
-        if write is not None:
-            with Image.open(picture) as image:
-                write({}, {"run": np.asarray(image.convert("RGB"))}, experiment.updates)
     shown.announce(config.method, config.seeds, result, path, picture)
     return result
 
@@ -164,24 +160,18 @@ def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
     """
     file, checkpoints = folder / SUMMARY, folder / "checkpoints"
     wrong = f"schedule.updates={updates}: the run in {folder}"
-    if not file.exists():
+    summary: dict[str, Any] | None = small_json(file)
+    if summary is None:
         latest = load_latest(checkpoints)
         made = 0 if latest is None else latest[1].get("updates")
         if isinstance(made, int) and made > updates:
             raise ConfigError(f"{wrong} has made {made} updates already")
         return None
-    try:
-        summary: dict[str, Any] = json.loads(read_bounded(file, LARGEST_FILE))
-        ended = int(summary["updates"])
-    except (ValueError, TypeError, KeyError) as error:
-        raise ConfigError(
-            f"{file}: is damaged; remove it to go on from the last checkpoint"
-        ) from error
-    if ended >= updates:
+    if summary["updates"] >= updates:
         return summary
     if not checkpoint_files(checkpoints):
         raise ConfigError(
-            f"{wrong} ended after {ended} updates and has no checkpoint to go on from"
+            f"{wrong} ended after {summary['updates']} updates and has no checkpoint to go on from"
         )
     with storage(file):
         file.unlink()
@@ -256,7 +246,7 @@ def run_name(config: RunConfig) -> str:
     return f"{config.method}{ablation}_seed_{'-'.join(map(str, config.seeds))}"
 
 
-def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
+def identity(experiment: Experiment, config: RunConfig, asked: Invocation) -> dict[str, Any]:
     """Returns what the run is, and what it is made with: method, seeds, machine, versions."""
     device = experiment.task.device
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else ""
@@ -268,9 +258,9 @@ def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
         "ablation": config.ablation,
         "seed": config.seed,
         "seeds": config.seeds,
-        "about": _about(config),
-        "overrides": overrides(),
-        "arguments": {"config_dir": _config_folder(), "pythonpath": _python_path()},
+        "about": _about(config, asked.config_dir),
+        "overrides": asked.overrides,
+        "arguments": {"config_dir": asked.config_dir, "pythonpath": asked.python_path},
         "solver_parameters": parameters // len(config.seeds),
         "device": f"{device.type} {name}".strip(),
         "machine": f"{processor()}, {os.cpu_count()} cores, {platform.system()}",
@@ -285,13 +275,13 @@ def identity(experiment: Experiment, config: RunConfig) -> dict[str, Any]:
     }
 
 
-def to_go_on(path: Path) -> str:
-    """Returns the command that resumes the run in a folder."""
-    paths, config = _python_path(), _config_folder()
+def to_go_on(asked: Invocation) -> str:
+    """Returns the command that resumes a run."""
+    paths, config = asked.python_path, asked.config_dir
     before = [f"PYTHONPATH={shlex.quote(paths)}"] if paths else []
     options = ["--config-dir", config] if config else []
-    own = [word for word in overrides() if not word.startswith("+sweep=")]
-    words = shlex.join([*options, *own, f"hydra.run.dir={quoted(str(path))}"])
+    own = [word for word in asked.overrides if not word.startswith("+sweep=")]
+    words = shlex.join([*options, *own, f"hydra.run.dir={quoted(str(asked.folder))}"])
     return " ".join([*before, "bin/train", words])
 
 
@@ -303,32 +293,10 @@ def quoted(path: str) -> str:
     return override_value(path)
 
 
-def _about(config: RunConfig) -> dict[str, str]:
+def _about(config: RunConfig, own: str | None) -> dict[str, str]:
     """Returns what method and ablation do, by the first lines of their files."""
-    own = _config_folder()
     folders = [CONFIG_FOLDER, *([Path(own)] if own else [])]
     chosen = {"method": config.method, "ablation": config.ablation}
     said = {group: choices(group, folders).get(name, "") for group, name in chosen.items()}
     needed = needs(folders).get(config.method)
     return said if needed is None else {**said, "needs": ", ".join(needed)}
-
-
-def _config_folder() -> str | None:
-    """Returns the folder given with ``--config-dir``; None without."""
-    sources = HydraConfig.get().runtime.config_sources
-    given = (source.path for source in sources if source.provider == "command-line")
-    return next(map(_from_here, given), None)
-
-
-def _python_path() -> str | None:
-    """Returns the caller's PYTHONPATH without the checkout, which bin/ adds."""
-    own = str(PACKAGE.parent)
-    given = [part for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part]
-    return os.pathsep.join(_from_here(part) for part in given if part != own) or None
-
-
-def _from_here(path: str) -> str:
-    """Returns a path relative to the working folder if it lies inside, else unchanged."""
-    inside = Path(path).resolve()
-    here = Path.cwd().resolve()
-    return str(inside.relative_to(here)) if inside.is_relative_to(here) else path

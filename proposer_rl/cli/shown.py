@@ -1,51 +1,25 @@
-"""What a run shows, and a sweep when it is over: it is read from their folders.
+"""The picture and the lines with which a run ends, and the table with which a sweep does.
 
 Training is given this module and knows nothing of what draws; figures take a while to import.
 """
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from hydra.core.hydra_config import HydraConfig
-from hydra.experimental.callback import Callback
-from hydra.types import RunMode
-from numpy.typing import NDArray
-from omegaconf import DictConfig
 from rich.console import Console
 
 from proposer_rl.cli.errors import say
-from proposer_rl.report.terminal import find_progress, overview, read_progress, screen
-from proposer_rl.runs.folder import FAILURE, is_rate
+from proposer_rl.report.terminal import find_progress, overview
+from proposer_rl.runs.folder import is_rate
 from proposer_rl.runs.records import level_text
 
 
-class SweepSummary(Callback):
-    """Lists the runs of a sweep when it is over.
-
-    The exit code is that of a run that failed in it; other sweeps may have the same folder.
-    """
-
-    def __init__(self) -> None:
-        self._failed_before: dict[Path, int] = {}
-
-    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Notes earlier failures in the sweep's folder, before the first run."""
-        self._failed_before = _failures(config)
-
-    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        """Prints the sweep's runs, and exits with a failed one's code."""
-        found = find_progress(Path(config.hydra.sweep.dir))
-        Console().print(overview(found))
-        failed = _failures(config).items() - self._failed_before.items()
-        if failed:
-            # Hydra turns an exception of a callback into a warning, but lets an exit through.
-            sys.exit(max(int(json.loads(file.read_text())["exit_code"]) for file, _ in failed))
+def show_sweep(folder: Path) -> None:
+    """Lists the runs of a sweep that is over."""
+    Console().print(overview(find_progress(folder)))
 
 
 def draw_run(folder: Path, title: str) -> Path:
@@ -55,22 +29,10 @@ def draw_run(folder: Path, title: str) -> Path:
     return figures.draw_run(folder, title)
 
 
-def last_map(folder: Path) -> NDArray[np.uint8] | None:
-    """Returns the heat map of a run's last proposals, uint8 [H, W, 3]; None where it has none."""
-    from proposer_rl.report import figures
-
-    return figures.last_map(folder)
-
-
 def announce(
     method: str, seeds: Sequence[int], result: Mapping[str, Any], folder: Path, picture: Path
 ) -> None:
-    """Prints the results; with a screen of the run, unless it is part of a sweep."""
-    if HydraConfig.get().mode != RunMode.MULTIRUN:
-        console = Console()
-        with console.capture() as printed:
-            console.print(screen(read_progress(folder)))
-        say(printed.get().removesuffix("\n"))
+    """Prints the results."""
     for seed, reached, final in zip(
         seeds, result["updates_to_threshold"], result["final"], strict=True
     ):
@@ -99,9 +61,3 @@ def _cost_text(result: Mapping[str, Any], seeds: int) -> str:
         f"Cost: {result['frames']:,} frames of the Solver{together}, "
         f"{result['curriculum_frames']:,} of its curriculum, {result['seconds']:.0f} s."
     )
-
-
-def _failures(config: DictConfig) -> dict[Path, int]:
-    """Returns the files that record failed runs in a sweep's folder, with their times."""
-    folder = Path(config.hydra.sweep.dir)
-    return {file: file.stat().st_mtime_ns for file in folder.rglob(FAILURE)}

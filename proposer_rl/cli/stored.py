@@ -13,7 +13,6 @@ from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import RunConfig, saved_config
 from proposer_rl.cli.errors import ConfigError
 from proposer_rl.learning import PPO
-from proposer_rl.models import own_state
 from proposer_rl.runs.checkpoint import (
     CheckpointError,
     checkpoint_files,
@@ -46,15 +45,21 @@ class StoredRun(NamedTuple):
     task: Task
     files: list[Path]  # its checkpoints, oldest first; at least one
 
-    @own_state()
-    def stage(self, file: Path | None = None) -> Stage:
-        """Returns the Solvers in one of the files; None stands for the newest intact one."""
+    def stage(self, file: Path | None = None, seeds: Sequence[int] | None = None) -> Stage:
+        """Returns the Solvers in one of the files; None stands for the newest intact one.
+
+        Of several seeds those that are given, None for all.
+        """
+        seeds = self.config.seeds if seeds is None else seeds
+        if strangers := set(seeds) - set(self.config.seeds):
+            raise ConfigError(f"seed={min(strangers)}: must be among {list(self.config.seeds)}")
         found = load_latest(self.files[-1].parent) if file is None else load_checkpoint(file)
         assert found is not None, "there is a checkpoint"
         step, state = found
-        learner = self.task.learner([Streams(seed) for seed in self.config.seeds])
+        learner = self.task.learner([Streams(seed) for seed in seeds])
         try:
-            learner.restore(TensorDict(state["solver"], [len(self.config.seeds)]))
+            every = TensorDict(state["solver"], [len(self.config.seeds)])
+            learner.restore(every[[self.config.seeds.index(seed) for seed in seeds]])
             return Stage(step, int(state["updates"]), learner)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise CheckpointError(
@@ -62,7 +67,6 @@ class StoredRun(NamedTuple):
             ) from error
 
 
-@own_state()
 def stored_run(path: Path) -> StoredRun:
     """Returns a run that has checkpoints.
 

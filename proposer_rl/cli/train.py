@@ -1,43 +1,46 @@
 """``bin/train``, but for its help: from the command line to the settings of one or more runs.
 
-What composes them needs no PyTorch, so that a typing error is told at once. Hydra makes a run's
-folder, or a sweep's, before anything here can look at the settings: a run that is refused leaves no
-folder, one that fails in a sweep leaves its reason.
+What composes them needs no PyTorch, so that a typing error is told at once. A run that fails in a
+sweep leaves its reason in its folder.
 """
 
 from __future__ import annotations
 
 import gc
-import math
+import json
 import os
-import shutil
 import sys
 import traceback
 from argparse import ArgumentParser
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from proposer_rl.cli.errors import UNFORESEEN, ConfigError, command, exit_code, one_line, refuse
-from proposer_rl.cli.groups import check_chosen, check_groups, explained, overrides
-from proposer_rl.recipes import CONFIG_FOLDER
+from proposer_rl.cli.groups import (
+    arranged,
+    check_chosen,
+    check_groups,
+    explained,
+    given_overrides,
+    invocation,
+)
+from proposer_rl.recipes import CONFIG_FOLDER, override
 from proposer_rl.runs.folder import FAILURE, RunFolder
-from proposer_rl.runs.process import InUseError, StopSignals
+from proposer_rl.runs.process import InUseError, StopSignals, guard_output
 
 LONGEST = 300  # characters of what is said of a lost job
-HYDRAS_OWN = {".hydra", "train.log", "multirun.yaml"}
-BEGUN: list[Path] = []  # folders of this process's runs: what comes after is no matter of overrides
-COMMAND: list[Path] = []  # the folder of the run or sweep, once the command has come so far
-NEW: list[Path] = []  # folders that were not there when the command began, the innermost first
+# The folder of the command's run or sweep, and the failures that a sweep's had before.
+COMMAND: list[tuple[Path, dict[Path, int] | None]] = []
 
 
 class LostJobError(RuntimeError):
@@ -49,16 +52,21 @@ class LostJobError(RuntimeError):
     exit_code = 6
 
 
-class Traces(Callback):
-    """Notes which folders the command is going to make."""
+class FailedRunError(RuntimeError):
+    """A run of a sweep has failed, which is recorded; sweepers count it as a failure."""
+
+
+class CommandFolder(Callback):
+    """Notes the folder of the command's run or sweep before Hydra makes it."""
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        """Notes a run's folder, before Hydra makes it."""
-        _note(config, "hydra.run.dir")
+        """Notes a run's folder."""
+        COMMAND.append((_expanded(config, "hydra.run.dir"), None))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Notes a sweep's folder, before Hydra makes it."""
-        _note(config, "hydra.sweep.dir")
+        """Notes a sweep's folder, and which runs failed there before."""
+        folder = _expanded(config, "hydra.sweep.dir")
+        COMMAND.append((folder, _failures(folder)))
 
 
 def main() -> None:
@@ -69,14 +77,15 @@ def main() -> None:
 
 
 def _compose_and_run() -> None:
-    _refuse_pickles(sys.argv)
-    BEGUN.clear()
+    COMMAND.clear()
     if sys.version_info >= (3, 14):  # it refuses a help text of Hydra's (to 1.3.8), no string
         ArgumentParser._check_help = lambda self, action: None
     try:
+        _prepare_arguments()
         _main()
+    except FailedRunError:
+        pass  # it has been told, and is in the sweep's overview
     except (HydraException, OmegaConfBaseException, UnicodeDecodeError, YAMLError) as error:
-        _remove_traces()
         raise ConfigError(explained(error)) from error
     except RuntimeError as error:
         if not type(error).__module__.startswith("submitit."):
@@ -84,77 +93,91 @@ def _compose_and_run() -> None:
         raise LostJobError(
             f"no job was sent, or it left no result: {one_line(error)[:LONGEST]}"
         ) from error
-    except OSError as error:  # of Hydra's own files
-        _remove_traces()
-        refuse(error, *COMMAND)
-    except ValueError as error:
-        if BEGUN:
+    except (OSError, ValueError) as error:
+        # Of Hydra's own files; logging hides it in a ValueError.
+        cause = error if isinstance(error, OSError) else error.__cause__
+        if not isinstance(cause, OSError):
             raise
-        _remove_traces()
-        if isinstance(error.__cause__, OSError):  # of the file that logging cannot open
-            refuse(error.__cause__)
-        raise ConfigError(one_line(error)) from error  # of an override such as +method=3
+        refuse(cause, *(folder for folder, _ in COMMAND))
+    for folder, failed_before in COMMAND:
+        if failed_before is not None:
+            from proposer_rl.cli.shown import show_sweep
+
+            show_sweep(folder)
+            failed = _failures(folder).items() - failed_before.items()
+            codes = [int(json.loads(file.read_text())["exit_code"]) for file, _ in failed]
+            sys.exit(max(codes, default=0))
 
 
 @hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="train")
 def _main(hydra_config: DictConfig) -> float:
-    BEGUN.append(path := Path(HydraConfig.get().runtime.output_dir))
+    guard_output()  # launchers start processes that begin here
+    about = HydraConfig.get()
+    path, in_sweep = Path(about.runtime.output_dir), about.mode == RunMode.MULTIRUN
     signals = StopSignals()
     try:
         (path / FAILURE).unlink(missing_ok=True)  # a run that failed is tried again
-        check_groups(overrides())
-        check_chosen(hydra_config)
+        asked = invocation(about, given_overrides(about), path)
+        check_groups(asked.overrides)
+        check_chosen(hydra_config, about)
         with signals:  # already now: amid imports is no place to stop
             from proposer_rl.cli import shown  # only now: it takes seconds
             from proposer_rl.cli.config import read_config
             from proposer_rl.cli.run import train
 
-            return train(read_config(hydra_config), path, signals, shown)
+            return train(read_config(hydra_config), asked, signals, shown)
     except Exception as error:
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
-            return _record_failure(path, error)
-        if exit_code(error) != UNFORESEEN:
-            _remove_traces()
-            refuse(error, path)
-        raise
+        if not in_sweep:
+            if exit_code(error) != UNFORESEEN:
+                refuse(error, path)
+            raise
+        message = _record_failure(path, error)
     finally:
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
+        if in_sweep:
             # Environments hang in circles and may hold gigabytes that Python does not see, as
             # MuJoCo's models; those of the next run would come on top.
             gc.collect()
+    # Not within the handler: the error's frames would hold the run's memory to the sweep's end.
+    raise FailedRunError(message)
 
 
-def _refuse_pickles(arguments: list[str]) -> None:
-    """Refuses --experimental-rerun, with which Hydra reads a pickle, that is, runs code."""
-    if any(argument.startswith("--experimental-rerun") for argument in arguments):
+def _prepare_arguments() -> None:
+    """Refuses options by what Hydra's parser reads, and puts overrides as Hydra takes them."""
+    read = get_args_parser().parse_args()
+    if read.experimental_rerun is not None:  # Hydra reads a pickle, that is, runs code
         raise ConfigError("--experimental-rerun: not supported; give the run's own arguments again")
+    folder = read.config_path or read.config_name
+    if read.config_dir and not folder and (CONFIG_FOLDER / Path(read.config_dir).name).is_dir():
+        folder = f"{read.config_dir} is a group"
+    if folder:
+        raise ConfigError(
+            f"{folder}: give the folder that holds task/, method/ and so on, and the file's name, "
+            "as in: --config-dir my_conf task=hill"
+        )
+    options = [word for word in sys.argv[1:] if word not in read.overrides]
+    sys.argv[1:] = [*arranged(read.overrides), *options]
 
 
-def _note(config: DictConfig, key: str) -> None:
-    COMMAND.clear()
-    NEW.clear()
-    # A folder's name that cannot be told is refused by Hydra right after this.
-    with suppress(OmegaConfBaseException):
-        path = Path(OmegaConf.select(config, key)).absolute()
-        COMMAND.append(path)
-        NEW.extend(folder for folder in (path, *path.parents) if not folder.exists())
+def _expanded(config: DictConfig, key: str) -> Path:
+    """Returns a folder of Hydra's configuration; ``~`` becomes the home folder there, too."""
+    given = str(OmegaConf.select(config, key))
+    path = Path(given).expanduser()
+    if given.startswith("~"):
+        with read_write(config.hydra), open_dict(config.hydra):
+            OmegaConf.update(config, key, str(path))
+            config.hydra.overrides.hydra.append(override(key, path))  # for a sweep's jobs
+    return path.absolute()
 
 
-def _remove_traces() -> None:
-    """Removes the folders that the command has made, unless there is more in them than Hydra's."""
-    for folder in NEW:
-        with suppress(OSError):
-            if {entry.name for entry in folder.iterdir()} <= HYDRAS_OWN:
-                shutil.rmtree(folder)
+def _failures(folder: Path) -> dict[Path, int]:
+    """Returns the files that record failed runs in a sweep's folder, with their times."""
+    return {file: file.stat().st_mtime_ns for file in folder.rglob(FAILURE)}
 
 
-def _record_failure(folder: Path, error: Exception) -> float:
-    """Records in a run's folder that it failed, and says so.
+def _record_failure(folder: Path, error: Exception) -> str:
+    """Records in a run's folder that it failed, and returns the line that says so.
 
     Nothing is recorded of a run that another process is working on: the folder is not ours.
-
-    Returns:
-        NaN, for the run's value.
     """
     message, code = one_line(error, folder), exit_code(error)
     if not isinstance(error, InUseError):
@@ -163,4 +186,4 @@ def _record_failure(folder: Path, error: Exception) -> float:
     if code == UNFORESEEN:
         traceback.print_exception(error)
     print(f"error: {message}", file=sys.stderr)
-    return math.nan
+    return message

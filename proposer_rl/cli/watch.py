@@ -9,15 +9,15 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-from rich.console import Console, RenderableType
+from rich.console import Console
 from rich.live import Live
 
 from proposer_rl.cli.errors import command, number
-from proposer_rl.report.terminal import find_progress, overview, screen
+from proposer_rl.report.terminal import find_progress, overview
 
 EPILOG = """\
 examples:
-  bin/watch outputs/perf_gain/2026-11-21_00-37-50_seed_0   one run: curves, gains, levels
+  bin/watch outputs/perf_gain/2026-11-21_00-37-50_seed_0   one run
   bin/watch sweeps/quick                                   a sweep: one line for each run
   bin/watch sweeps/quick --once                            print once, for a file or a pipe"""
 
@@ -29,21 +29,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(options: argparse.Namespace) -> None:
     console = Console()
-    picture = draw(options.folder)
+    table = overview(find_progress(options.folder))
     if options.once or not console.is_terminal:
-        console.print(picture)
+        console.print(table)
         return
-    shown = Live(picture, console=console, auto_refresh=False, screen=True)
+    shown = Live(table, console=console, auto_refresh=False, screen=True)
     with suppress(KeyboardInterrupt), shown as live:
-        while True:
+        while console.is_terminal:  # until it is closed
             time.sleep(options.seconds)
-            live.update(draw(options.folder), refresh=True)
-
-
-def draw(folder: Path) -> RenderableType:
-    """Returns the folder's run as a screen, or its runs as a table."""
-    found = find_progress(folder)
-    return screen(found[0]) if len(found) == 1 else overview(found)
+            live.update(overview(find_progress(options.folder)), refresh=True)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -24,22 +24,10 @@ from proposer_rl.experiment.tables import Log, RunTables
 from proposer_rl.learning import PPO, located
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_latest, save_checkpoint
 from proposer_rl.runs.folder import SLACK, RunFolder, can_reach, read_csv
-from proposer_rl.runs.process import Status, StopRequested, StopSignals
-from proposer_rl.settings import ArgumentError, NotNegative, settings
+from proposer_rl.runs.process import Output, Status, StopRequested, StopSignals
+from proposer_rl.settings import ArgumentError, settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import NoSuccessError, Task
-
-
-@settings
-class _Counted:
-    """The counts of a checkpoint, which are checked, since anybody may have written it."""
-
-    updates: Annotated[int, Ge(0)]
-    cycles: Annotated[int, Ge(0)]
-    curriculum_frames: Annotated[int, Ge(0)]
-    evaluations: Annotated[int, Ge(0)]
-    seconds: NotNegative
-    rows: dict[str, Annotated[int, Ge(0)]]
 
 
 class Experiment:
@@ -141,20 +129,22 @@ class Experiment:
             StorageError: if the disk does not take a file.
         """
         resumed = self._resume()
+        errors = Output(sys.stderr)
         bar = tqdm(
             total=self.schedule.updates,
             initial=self.updates,
             desc="Solver updates",
+            file=errors,
             disable=not self._progress,
             smoothing=0,
             # A file gets a line now and then, not thousands.
-            mininterval=0.1 if sys.stderr.isatty() else 30,
+            mininterval=0.1 if errors.isatty() else 30,
             dynamic_ncols=True,
         )
 
         def show() -> None:
             text = ", ".join(filter(None, [self._headline_text(), self._status.doing]))
-            bar.set_postfix_str(text, refresh=sys.stderr.isatty())
+            bar.set_postfix_str(text, refresh=errors.isatty())
 
         with bar, self._status.of_run(self.folder.path, show):
             if not resumed:
@@ -312,6 +302,7 @@ class Experiment:
         try:
             self._restore(state)
             self.folder.cut_back(state["rows"])
+            self._tables.log_again(self.updates)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             reason = " ".join(str(error).split())
             raise CheckpointError(
@@ -320,18 +311,14 @@ class Experiment:
         return True
 
     def _restore(self, state: State) -> None:
-        length = self.schedule.cycle_length
-        read = _Counted(**{name: state[name] for name in _Counted.__annotations__})
-        updates, cycles = read.updates, read.cycles
-        if not (cycles - 1) * length <= updates <= cycles * length:
-            raise ValueError(f"cycles={cycles}, of {length} updates each, but updates={updates}")
         self.learner.restore(TensorDict(state["solver"], [len(self.seeds)]))
         self.curriculum.load_state_dict(dict(state["curriculum"]))
         if self._continued is not None:
             self._continued.load_state_dict(state["episodes"])
-        self.updates, self.cycles = updates, cycles
-        self.student.frames, self.student.evaluations = read.curriculum_frames, read.evaluations
-        self._seconds_before = read.seconds
+        self.updates, self.cycles = state["updates"], state["cycles"]
+        self.student.frames = state["curriculum_frames"]
+        self.student.evaluations = state["evaluations"]
+        self._seconds_before = state["seconds"]
         self._started = time.monotonic()
         self._headline = [float(value) for value in state["headline"]]
 

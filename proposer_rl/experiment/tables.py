@@ -1,4 +1,4 @@
-"""What an experiment writes into its folder, and tells a logger of."""
+"""The tables that an experiment writes into its folder, and their rows for a logger."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import Any
 
 from tensordict import TensorDictBase
 
-from proposer_rl.runs.folder import RunFolder
+from proposer_rl.runs.folder import RunFolder, read_table
 from proposer_rl.task import Task
 
 Log = Callable[[str, Mapping[str, Any], int], None]
 """Receives each row of the first copy: its table, its values and its update."""
 
 RECORDED_LEVELS = 8
+LOGGED = ("metrics.csv", "training.csv", "cycles.jsonl")  # of numbers
 
 
 class RunTables:
@@ -31,7 +32,7 @@ class RunTables:
     ) -> None:
         """Writes a row for each of K Solvers: its measurements, [K], and the costs so far."""
         for seed, values in self._per_copy(measured):
-            self._append("metrics.csv", updates, seed, {**costs, **values})
+            self._append("metrics.csv", {"seed": seed, "updates": updates, **costs, **values})
 
     def add_levels(self, updates: int, reached: Mapping[str, TensorDictBase]) -> None:
         """Writes each Solver's results on each evaluation level, [K, E] by distribution."""
@@ -47,14 +48,12 @@ class RunTables:
         """Writes PPO's numbers [K] of an update, and a sample of its levels [K, P]."""
         trained_on = self._task.training_metrics(levels, rollout)
         for seed, values in self._per_copy(trained_on, metrics):
-            self._append("training.csv", updates, seed, values)
+            self._append("training.csv", {"seed": seed, "updates": updates, **values})
         some = slice(RECORDED_LEVELS)
         for copy, seed in enumerate(self._seeds):
             sample = self._task.record(levels[copy, some], rollout[copy, some])
             row = {"updates": updates, "seed": seed, "levels": sample}
             self._folder.append("curriculum.jsonl", row)
-            if copy == 0:
-                self._log("curriculum", row, updates)
 
     def add_cycle(
         self, updates: int, cycle: int, metrics: Mapping[str, Any], costs: Mapping[str, float]
@@ -65,13 +64,29 @@ class RunTables:
             shown = told["levels"].items()
             told["levels"] = {text: self._task.record(some, None) for text, some in shown}
         spent = {name: costs[name] for name in ("curriculum_frames", "evaluations")}
-        self._folder.append("cycles.jsonl", {"cycle": cycle, "updates": updates, **spent, **told})
-        self._log("cycles", told, updates)
+        self._append("cycles.jsonl", {"cycle": cycle, "updates": updates, **spent, **told})
 
-    def _append(self, table: str, updates: int, seed: int, values: Mapping[str, float]) -> None:
-        self._folder.append(table, {"seed": seed, "updates": updates, **values})
-        if seed == self._seeds[0]:
-            self._log(Path(table).stem, values, updates)
+    def log_again(self, updates: int) -> None:
+        """Logs again the rows of the update that a run goes on from.
+
+        A logger then drops what it has from this update on.
+
+        Raises:
+            ValueError: naming the file and its line, if a table cannot be read.
+        """
+        files = [self._folder.path / name for name in LOGGED if name in self._folder.lengths()]
+        rows = [(file.name, row) for file in files for row in read_table(file)]
+        for table, row in rows:
+            if row["updates"] == updates:
+                self._tell(table, row)
+
+    def _append(self, table: str, row: Mapping[str, Any]) -> None:
+        self._folder.append(table, row)
+        self._tell(table, row)
+
+    def _tell(self, table: str, row: Mapping[str, Any]) -> None:
+        if row.get("seed", self._seeds[0]) == self._seeds[0]:
+            self._log(Path(table).stem, row, row["updates"])
 
     def _per_copy(self, *told: TensorDictBase) -> Iterator[tuple[int, dict[str, float]]]:
         for copy, seed in enumerate(self._seeds):

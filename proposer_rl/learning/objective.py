@@ -119,9 +119,6 @@ class LeaveOneOutBaseline(TensorDictModuleBase):
     Args:
         gamma: discount.
 
-    Raises:
-        ValueError: when called on fewer than two replicas.
-
     Example:
         Three replicas, one step each:
 
@@ -142,8 +139,6 @@ class LeaveOneOutBaseline(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes ``advantage`` and ``value_target``, [K, T, 1], into a rollout [K, T]."""
         copies = tensordict.batch_size[0]
-        if copies < 2:
-            raise ValueError("a baseline from the other copies needs at least 2 copies, got 1")
         reward = tensordict["next", "reward"]
         # TorchRL's sum breaks off where a power of the discount is lost in rounding: here before
         # the first term.

@@ -34,7 +34,6 @@ from proposer_rl.learning.snapshot import (
 )
 from proposer_rl.learning.training_batch import Minibatches, Statistics
 from proposer_rl.models import ActorCritic, Population
-from proposer_rl.settings import ArgumentError
 
 DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # beside the terms, where a loss has them
 
@@ -62,9 +61,7 @@ class PPO:
             None for :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:
-        ValueError: if the environment's first dimension is not the agent's number of replicas, or
-            the loss reduces what belongs to different replicas.
-        ArgumentError: if ``anneal_clip`` has nothing to anneal.
+        ValueError: if the loss reduces what belongs to different replicas.
 
     Example:
         A linear policy and value for one environment of Gymnasium's:
@@ -91,11 +88,6 @@ class PPO:
         advantage: Callable[[TensorDictBase], TensorDictBase] | None = None,
         loss: MakeLoss | None = None,
     ) -> None:
-        if agent.copies is not None and env.batch_size[:1] != (agent.copies,):
-            raise ValueError(
-                f"the agent has {agent.copies} copies, so the environment's first dimension must "
-                f"be {agent.copies}; its batch size is {list(env.batch_size)}"
-            )
         self.env, self.agent, self.settings = env, agent, settings
         self.collector = RolloutCollector(
             env, agent, settings.horizon, continued=settings.continue_episodes
@@ -115,9 +107,6 @@ class PPO:
             clip_value=settings.clip_value,
         )
         self._loss = objective.make_loss(loss or clipped, agent)
-        annealed = settings.anneal_updates is not None and hasattr(self._loss, "clip_epsilon")
-        if settings.anneal_clip and not annealed:
-            raise ArgumentError("anneal_clip=True: needs anneal_updates, and PPO's own loss")
         self._parameters = list(agent.parameters())
         self._adam = complete_adam(self._parameters, settings.learning_rate, settings.adam_eps)
         self._gradient_steps = 0

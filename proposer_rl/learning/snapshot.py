@@ -62,26 +62,14 @@ def restore_snapshot(agent: ActorCritic, adam: Adam, snapshot: TensorDictBase) -
         The number of Adam's steps so far.
 
     Raises:
-        ValueError: if its batch, a parameter's name or shape, or Adam's steps do not fit.
+        ValueError: if it is of another network, or its replicas differ in Adam's steps.
     """
-    if snapshot.batch_size != _batch(agent):
-        raise ValueError(
-            f"the snapshot must have batch size {list(_batch(agent))}, "
-            f"got {list(snapshot.batch_size)}"
-        )
+    load_agent(agent, snapshot)
     parameters = dict(agent.named_parameters())
-    values = agent_values(agent)
-    if values.keys() != set(snapshot.keys()):
-        raise ValueError("the snapshot belongs to another network: its parameters differ")
-    for name, value in values.items():
-        if snapshot[name, "value"].shape != value.shape:
-            raise ValueError(f"the snapshot's {name} does not fit: another shape")
     steps = torch.stack([snapshot[name, "step"].flatten() for name in parameters])
     # The one question here that waits for the device.
     if not bool((steps == steps[:, :1]).all()):
         raise ValueError("the snapshot's copies have made different numbers of Adam steps")
-    for name, value in values.items():
-        value.data.copy_(snapshot[name, "value"])
     for name, parameter in parameters.items():
         entry, state = snapshot[name], adam.state[parameter]
         state["exp_avg"].copy_(entry["exp_avg"])

@@ -115,7 +115,7 @@ class Statistics:
             all begin.
 
     Raises:
-        ArgumentError: if there is nothing to be normalised.
+        ArgumentError: if the agent reads its level once for a whole rollout.
     """
 
     def __init__(self, env: EnvBase, agent: ActorCritic, settings: PPOSettings) -> None:
@@ -135,11 +135,6 @@ class Statistics:
                 for key, spec in specs.items()
                 if spec is not None and spec.dtype.is_floating_point
             }
-            if not shapes:
-                raise ArgumentError(
-                    "normalize_observations=True: there are no numbers in what is observed, such "
-                    "as bytes of an image; leave False"
-                )
         agent.normalization = None
         if shapes or settings.normalize_rewards:
             numbers = Normalization(agent.copies, shapes, rewards=settings.normalize_rewards)

@@ -23,7 +23,7 @@ from proposer_rl.meta.assembly import ProposerSettings, meta_env
 from proposer_rl.meta.env import SolverTrainingEnv, action_generators
 from proposer_rl.meta.rewards import Reward
 from proposer_rl.meta.workers import WorkersError, WorkerSettings, lost, quiet, start, stop
-from proposer_rl.models import ActorCritic, own_state, uniform_noise, use_device
+from proposer_rl.models import ActorCritic, uniform_noise, use_device
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
@@ -191,7 +191,6 @@ class WorkerEnv(SolverTrainingEnv):
         self.diverged = None
         super().fork(solver, streams)
 
-    @own_state()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.diverged is None:
             try:
@@ -206,7 +205,6 @@ class WorkerEnv(SolverTrainingEnv):
         return state.set("reward", torch.full_like(state["return"], torch.nan))
 
 
-@own_state()
 def worker_env(
     make_task: Callable[[str], Task],
     config: ProposerSettings,

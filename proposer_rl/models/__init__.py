@@ -16,11 +16,10 @@ from proposer_rl.models.memory import MemoryNetwork as MemoryNetwork
 from proposer_rl.models.memory import memory_actor_critic as memory_actor_critic
 from proposer_rl.models.population import Population as Population
 from proposer_rl.models.population import available_cores as available_cores
+from proposer_rl.models.population import check_torch_defaults as check_torch_defaults
 from proposer_rl.models.population import use_device as use_device
 from proposer_rl.models.proposer import MapEncoder as MapEncoder
 from proposer_rl.models.proposer import MixtureHead as MixtureHead
 from proposer_rl.models.proposer import ProblemHead as ProblemHead
 from proposer_rl.models.proposer import ProposerNetwork as ProposerNetwork
 from proposer_rl.models.proposer import proposer_actor_critic as proposer_actor_critic
-from proposer_rl.models.torch_state import callers_state as callers_state
-from proposer_rl.models.torch_state import own_state as own_state

@@ -46,9 +46,6 @@ class UNet(nn.Module):
         groups: groups of every GroupNorm; divides each of ``channels``.
         head_gains: gain of each head's orthogonal initialisation.
 
-    Raises:
-        ValueError: if a channel count is not a multiple of ``groups``.
-
     Example:
         >>> network = UNet(channels=(8, 16))
         >>> logits, value = network(torch.zeros(2, 3, 9, 13))
@@ -65,8 +62,6 @@ class UNet(nn.Module):
         head_gains: Sequence[float] = (1.0, 1.0),
     ) -> None:
         super().__init__()
-        if any(width % groups for width in channels):
-            raise ValueError(f"channels must be multiples of groups={groups}, got {list(channels)}")
         inputs = [in_channels, *channels[:-1]]
         self.down = nn.ModuleList(
             DoubleConv(i, o, groups) for i, o in zip(inputs, channels, strict=True)

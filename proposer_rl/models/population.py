@@ -45,8 +45,7 @@ class Population(nn.Module):
             a GPU but not on a CPU, where only very small networks are faster that way.
 
     Raises:
-        ValueError: for fewer than one replica or core, another precision, or a network with
-            buffers.
+        ValueError: for a network with buffers.
 
     Example:
         >>> population = Population(lambda: nn.Linear(3, 2), copies=5)
@@ -64,10 +63,6 @@ class Population(nn.Module):
     ) -> None:
         super().__init__()
         cores = available_cores() if cores is None else cores
-        if min(copies, cores) < 1:
-            raise ValueError(f"copies and cores must be at least 1, got {copies} and {cores}")
-        if precision not in ("fp32", "bf16"):
-            raise ValueError(f"precision must be 'fp32' or 'bf16', got {precision!r}")
         members = [make() for _ in range(copies)]
         if next(members[0].buffers(), None) is not None:
             raise ValueError("a Population's network must not have buffers")
@@ -281,6 +276,33 @@ def available_cores() -> int:
 def at_hand(tensor: Tensor) -> bool:
     """Returns whether a tensor's numbers can be read without waiting for a device."""
     return tensor.device.type == "cpu"
+
+
+class TorchDefaultsError(ValueError):
+    """A default of torch's is set under which numbers would differ; the message is one line."""
+
+    exit_code = 2
+
+
+def check_torch_defaults() -> None:
+    """Refuses a default dtype other than float32, and a default device other than the CPU.
+
+    Random draws and networks would be others without a word.
+
+    Raises:
+        TorchDefaultsError: naming torch's own setting, and how to put it back.
+    """
+    dtype, device = torch.get_default_dtype(), torch.empty(0).device
+    if dtype != torch.float32:
+        raise TorchDefaultsError(
+            f"torch.get_default_dtype() is {dtype}, and must be torch.float32: put it back with "
+            "torch.set_default_dtype(torch.float32)"
+        )
+    if device.type != "cpu":
+        raise TorchDefaultsError(
+            f"torch.get_default_device() is {device}, and must be cpu: put it back with "
+            "torch.set_default_device(None), or leave the `with torch.device(...)`"
+        )
 
 
 def use_device(device: torch.device) -> None:

@@ -25,11 +25,10 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from proposer_rl.play.session import LARGEST_BODY, Examine, Session, Source, Write
+from proposer_rl.play.session import Examine, Session, Source, Write
 from proposer_rl.runs.records import checked, printable
 
 HOSTS = ["127.0.0.1", "localhost"]
-LARGEST_REFUSED = 2**26  # bytes of a body that are read to their end, so that its sender is told
 STATIC = Path(__file__).parent / "static"
 TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
 # Scripts, styles and connections of this server alone; pictures also as data, as records have them.
@@ -148,22 +147,15 @@ async def _told(function: Callable[[], Any], _: Request) -> Response:
 
 
 async def _answered(kind: Any, function: Callable[[Any], Any], request: Request) -> Response:
-    body = bytearray()
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > LARGEST_REFUSED:
-            break
-    if len(body) > LARGEST_BODY:
-        error = {"error": f"at most {LARGEST_BODY:,} bytes are read"}
-        return JSONResponse(error, status_code=413, headers={"Connection": "close"})
     if request.headers.get("content-type") != "application/json":
         return JSONResponse({"error": "must be application/json"}, status_code=415)
-    return await _result(lambda: function(checked(kind, bytes(body), "")))
+    body = await request.body()
+    return await _result(lambda: function(checked(kind, body, "")))
 
 
 async def _result(function: Callable[[], Any]) -> Response:
     """Returns what a function returns, as JSON; or the line of its error."""
     try:
         return JSONResponse(await run_in_threadpool(function))
-    except (ValueError, OSError) as error:
+    except (ValueError, LookupError, OSError) as error:
         return JSONResponse({"error": printable(str(error))}, status_code=400)

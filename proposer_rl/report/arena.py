@@ -247,10 +247,9 @@ def _names(studies: Sequence[Study]) -> list[str]:
     """Returns unique names of tasks: as on the command lines, or else the studies' titles."""
     names, seen = [], Counter[str]()
     for study in studies:
-        given = study.example.facts.get("overrides")
-        words = [word for word in given if isinstance(word, str)] if isinstance(given, list) else []
-        called = [word.removeprefix("task=") for word in words if word.startswith("task=")]
-        name = next((name for name in called if name.isprintable()), study.title)
+        words = study.example.facts.get("overrides") or []
+        called = (word.removeprefix("task=") for word in words if word.startswith("task="))
+        name = next(called, study.title)
         seen[name] += 1
         names.append(f"{name} #{seen[name]}" if seen[name] > 1 else name)
     return names

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from proposer_rl.report import arena, figures, outcomes, page, runs
+from proposer_rl.report import arena, figures, outcomes, page, runs, teachers
 from proposer_rl.report.charts import charts
 from proposer_rl.report.outcomes import Meanings, answer
 from proposer_rl.report.reading import OutputError, begun, find_runs
@@ -22,6 +22,7 @@ from proposer_rl.runs.folder import can_reach, is_rate, write_atomically
 from proposer_rl.runs.records import encoded, words
 
 PAGE = "report.html"
+LOG = ".jsonl"  # the suffix of teachers' logs
 FIGURES, TABLES = "figures", "tables"
 
 # In the order of the page.
@@ -78,7 +79,7 @@ def write_report(
     """Writes a report and returns the path of its page.
 
     Args:
-        folders: of runs, or with runs in them.
+        folders: of runs, or with runs in them; or files of ``teacher.log``, ``*.jsonl``.
         output: folder to write to; a report in it is replaced, other files stay.
         threshold: of the headline measurement, in place of the runs' own.
         baselines: labels of methods that the others are measured against: on each task the first,
@@ -89,7 +90,10 @@ def write_report(
             that do not tell.
     """
     check_output(output, PAGE, f"{TABLES}/runs.csv")
-    studies, notes = read_checked(folders, threshold, baselines)
+    logs = [path for path in folders if path.suffix == LOG]
+    curves = teachers.read_curves(logs)
+    of_runs = [path for path in folders if path.suffix != LOG]
+    studies, notes = read_checked(of_runs, threshold, baselines) if of_runs else ([], [])
     files: dict[str, bytes] = {}
     sections: list[page.Section] = []
     title = "Curricula: what the runs show"
@@ -107,9 +111,20 @@ def write_report(
                 prefix += f"{len(sections) + 1}_"
             sections.append(_section(study, prefix, files, bar, meanings or {}))
             parts.append(page.section(study, f"{FIGURES}/{prefix}"))
+    told: page.Section | None = None
+    if curves.logs:
+        drawings = teachers.drawings(curves.logs)
+        still = [page.figure(one, _drawn(one, "", files)) for one in drawings]
+        told = {"notes": curves.notes, "figures": still}
+        parts.append(page.of_teachers(drawings, curves.notes, f"{FIGURES}/"))
     command = page.report_command("bin/report", folders, threshold, baselines)
     html = page.render(
-        title=title, command=command, sections=sections, notes=notes, arena=over_tasks
+        title=title,
+        command=command,
+        sections=sections,
+        notes=notes,
+        arena=over_tasks,
+        teachers=told,
     )
     files["report.md"] = encoded(page.document(parts, command, notes))
     for path in (output / FIGURES, output / TABLES):  # what a former report had in them goes
@@ -123,9 +138,7 @@ def write_report(
 
 def check_output(output: Path, *signs: str) -> None:
     """Refuses an output folder that holds files which no report has written."""
-    if output.exists() and not output.is_dir():
-        raise OutputError(f"{output}: is a file; give a folder for the report")
-    occupied = output.is_dir() and any(output.iterdir())
+    occupied = output.exists() and any(output.iterdir())
     if occupied and not any((output / sign).is_file() for sign in signs):
         raise OutputError(
             f"{output}: has files in it but no {' or '.join(signs)}; give a new folder or one that "
@@ -138,14 +151,20 @@ def _over_tasks(compared: arena.Arena, files: dict[str, bytes]) -> page.Section:
     tables = [arena.summary(compared), arena.task_table(compared)]
     _add(tables, "", files)
     drawing = arena.differences(compared)
-    svg, png = render(drawing, "svg", "png")
-    files |= {f"{FIGURES}/{drawing.name}.svg": svg, f"{FIGURES}/{drawing.name}.png": png}
     return {
         "answer": arena.answer(compared),
         "summary": tables[0],
         "tasks": tables[1],
-        "figure": page.figure(drawing, png),
+        "figure": page.figure(drawing, _drawn(drawing, "", files)),
     }
+
+
+def _drawn(drawing: Drawing, prefix: str, files: dict[str, bytes]) -> bytes:
+    """Returns a figure as PNG, and adds its files to ``files``."""
+    svg, png = render(drawing, "svg", "png")
+    path = f"{FIGURES}/{prefix}{drawing.name}"
+    files |= {f"{path}.svg": svg, f"{path}.png": png}
+    return png
 
 
 def _add(tables: Sequence[Table], prefix: str, files: dict[str, bytes]) -> None:
@@ -168,11 +187,8 @@ def _section(
     for draw in DRAWINGS:
         drawing = draw(study)
         if drawing is not None:
-            path = f"{FIGURES}/{prefix}{drawing.name}"
-            svg, png = render(drawing, "svg", "png")
-            if draw in STILL:
-                still.append(page.figure(drawing, png))
-            files |= {f"{path}.svg": svg, f"{path}.png": png}
+            png = _drawn(drawing, prefix, files)
+            still += [page.figure(drawing, png)] if draw in STILL else []
         bar.update()
     data = charts(study)
     return {

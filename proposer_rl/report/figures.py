@@ -10,10 +10,8 @@ from textwrap import fill
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure, FigureBase
-from numpy.typing import NDArray
 
 from proposer_rl.report import measures
 from proposer_rl.report.comparisons import waiting_outcome
@@ -299,21 +297,6 @@ def heat_maps(study: Study) -> Drawing | None:
         1,
         size=STRIP,
     )
-
-
-def last_map(folder: Path) -> NDArray[np.uint8] | None:
-    """Returns the heat map of a run's last cycle, uint8 [H, W, 3]; None without proposals."""
-    run = read_run(folder)[0]
-    shares = run.shares(run.cycles[-1]) if run.cycles else None
-    if shares is None:
-        return None
-    with rc_context(SETTINGS):
-        drawn = share_map(shares)
-        figure = Figure(figsize=SINGLE, layout="constrained")
-        _draw_maps(figure, [figure.subplots()], [drawn], run, drawn.max())
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def _draw_strip(figure: FigureBase, group: Group, updates: Column, shares: Column) -> None:

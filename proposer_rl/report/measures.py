@@ -15,7 +15,6 @@ from proposer_rl.report.studies import Group, Study
 from proposer_rl.runs.folder import is_rate
 from proposer_rl.runs.records import (
     GAINS,
-    LONGEST_TEXT,
     PLACE,
     Column,
     Record,
@@ -127,7 +126,7 @@ def own_numbers(study: Study) -> list[Measure]:
     """Returns shares of batches, and all numbers of cycles that are not drawn elsewhere."""
     cycles = [cycle for group in study.groups for run in group.logs for cycle in run.cycles]
     found = {name for c in cycles for name, value in c.items() if not math.isnan(number(value))}
-    names = {n for n in found - PLACE - GAINS.keys() if n.isprintable() and len(n) <= LONGEST_TEXT}
+    names = found - PLACE - GAINS.keys()
     texts = {name: text for name, text in OWN.items() if name in names}
     texts |= {name: name.replace("_", " ") for name in sorted(names - texts.keys())}
     arms = list(dict.fromkeys(name for cycle in cycles for name in batch_shares(cycle)))[:MOST]

@@ -24,15 +24,11 @@ from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import (
     FEWEST,
     INTERVALS,
-    interquartile_mean,
-    jackknife,
-    median_interval,
     probability_of_improvement,
 )
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, write
-from proposer_rl.runs.folder import is_rate
-from proposer_rl.runs.records import LONGEST_TEXT, level_text, printable, words
+from proposer_rl.runs.records import level_text, words
 
 MILLION = 1e6
 # What methods and ablations do, by ``method`` or ``ablation`` and name.
@@ -103,21 +99,26 @@ def group_table(study: Study) -> Table:
     """Returns a table with a row for each group."""
     headline, horizon, threshold = study.headline, study.horizon, study.threshold
     first, waiting, *ends = outcomes(study)
-    shown, worst = [waiting, first, *ends], f"{headline}_worst10"
+    shown, baseline = [waiting, first, *ends], study.baseline
+    worst, tenth = f"{headline}_worst10", f"{words(headline)}, worst 10 %"
     rows: list[dict[str, Cell]] = []
     for group in study.groups:
         whole = study.group(group.label) or replace(group, runs=())
         runs, begun = whole.runs, len(group.runs)
         reached = sum(run.reached(headline, threshold) >= 0 for run in runs)
+        both = [first.values(group), first.values(baseline)]
+        other = group.label != baseline.label and all(both)
         row: dict[str, Cell] = {
             "method": group.label,
             "seeds": begun if len(runs) == begun else f"{len(runs)} of {begun}",
             f"reached {level_text(headline, threshold)}": f"{reached} of {len(runs)}",
             **{outcome.name: outcome.median(whole) for outcome in shown},
-            **_over_levels(study, group),
+            f"P(better than {baseline.label})": probability_of_improvement(*both)
+            if other
+            else None,
         }
         if any(worst in run.metrics for run in study.runs):
-            row[f"{words(headline)}, worst 10 %"] = at_the_end(study, worst).median(whole)
+            row[tenth] = at_the_end(study, worst).median(whole)
         cost: dict[str, Callable[[Run], float]] = {
             "frames (M)": lambda run: run.last("frames") / MILLION,
             "with the curriculum's (M)": lambda run: run.total_frames[-1] / MILLION,
@@ -132,31 +133,10 @@ def group_table(study: Study) -> Table:
     note = (
         f"Updates: min(updates, {horizon}) of the runs of full length; measured every "
         "few updates, so never exact. Frames: the Solver's own, and with all that the curriculum "
-        "spent. Evaluations: of levels, asked for by the curriculum. IQM: mean of the middle half "
-        "of all levels of all seeds, with the jackknife's interval over seeds; optimality gap: 1 - "
-        "success; both of those runs alone that have single levels. P(better): that a run of the "
-        f"method has the higher {primary(study).name}. {INTERVALS}"
+        "spent. Evaluations: of levels, asked for by the curriculum. P(better): that a run of the "
+        f"method has the higher {first.name}. {INTERVALS}"
     )
-    return Table("methods", "Methods", note, rows)
-
-
-def _over_levels(study: Study, group: Group) -> dict[str, Cell]:
-    """Returns a row's cells on single levels and the baseline; empty ones where not known."""
-    name, outcome, baseline = study.headline, primary(study), study.baseline
-    scores = study.scores(group, name)
-    row: dict[str, Cell] = {}
-    if any(study.scores(each, name) is not None for each in study.groups):
-        iqm = None if scores is None else jackknife(interquartile_mean, scores)
-        row[f"IQM of {words(name)}"] = iqm
-        if is_rate(name):
-            gap = None if scores is None else median_interval(1 - scores.mean(1))
-            row[f"optimality gap of {words(name)}"] = gap
-    values = [outcome.values(each) for each in (group, baseline)]
-    compared = group.label != baseline.label and all(values)
-    row[f"P(better than {baseline.label})"] = (
-        probability_of_improvement(*values) if compared else None
-    )
-    return row
+    return Table("methods", "Methods", note, rows, [tenth])
 
 
 def run_table(study: Study) -> Table:
@@ -214,12 +194,11 @@ def answer(study: Study) -> tuple[str, str]:
 def meaning(group: Group, meanings: Meanings) -> str:
     """Returns what a method does, in a line: as its runs recorded it, or else as given."""
     run = group.runs[0]
-    about = run.facts.get("about")
-    own = about if isinstance(about, Mapping) else {}
-    said = []
-    for kind, name in (("method", run.method), ("ablation", run.ablation)):
-        text = own.get(kind) or meanings.get(kind, {}).get(name, "")
-        said.append(printable(str(text))[:LONGEST_TEXT])
+    about = run.facts.get("about", {})
+    said = [
+        about.get(kind) or meanings.get(kind, {}).get(name, "")
+        for kind, name in (("method", run.method), ("ablation", run.ablation))
+    ]
     text = said[0] or "Its runs do not say what it does."
     text += f" Changed here: {said[1]}" if said[1] else ""
     return f"{text} ({group.setting})" if group.setting else text

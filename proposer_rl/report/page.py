@@ -26,7 +26,6 @@ from proposer_rl.report.tables import Table, escape_markdown
 from proposer_rl.runs.records import anywhere, level_text, words
 
 PIXELS = 78  # of an inch of a figure
-LONGEST_WORD = 2000  # of a command
 MARKS = {"": "", "o": "●", "s": "■", "^": "▲", "D": "◆", "v": "▼", "P": "✚", "X": "✖"}
 
 
@@ -155,7 +154,7 @@ def commands(study: Study) -> list[str]:
 def configs(study: Study) -> list[tuple[str, str]]:
     """Returns the label and the settings, as JSON, of each group's first run."""
     return [
-        (group.label, anywhere(json.dumps(group.runs[0].config, indent=1)[:20_000]))
+        (group.label, anywhere(json.dumps(group.runs[0].config, indent=1)))
         for group in study.groups
     ]
 
@@ -180,29 +179,20 @@ def report_command(
 
 def _command(run: Run) -> str:
     """Returns a run's command, ending in ``seed=`` if it had one seed; empty if not recorded."""
-    overrides, arguments = run.facts.get("overrides"), run.facts.get("arguments", {})
-    if not isinstance(overrides, list) or not isinstance(arguments, dict):
-        return ""
-    paths, config = arguments.get("pythonpath"), arguments.get("config_dir")
-    own = ("seed=", "seeds=", "hydra.", "+sweep=", "compute.", "logger")
-    words = [word for word in overrides if not (isinstance(word, str) and word.startswith(own))]
-    if not all(
-        isinstance(word, str) and word.isprintable() and len(word) <= LONGEST_WORD
-        for word in (*words, paths or "", config or "")
-    ):
-        return ""
+    words = run.facts.get("overrides") or []
     # A task or curriculum of one's own that prl.train was given is in no override.
     if "~task" in words or not any(word.lstrip("+").startswith("method=") for word in words):
         return ""
+    arguments = run.facts.get("arguments", {})
+    paths, config = arguments.get("pythonpath"), arguments.get("config_dir")
+    own = ("seed=", "seeds=", "hydra.", "+sweep=", "compute.", "logger")
+    kept = [word for word in words if not word.startswith(own)]
     many, seeds = ["-m"], "seed="
     if run.shared_by > 1:
-        together = run.config.get("seeds")
-        if not (isinstance(together, list) and all(isinstance(seed, int) for seed in together)):
-            return ""
-        many, seeds = [], f"seeds=[{_joined(together)}]"
+        many, seeds = [], f"seeds=[{_joined(run.config['seeds'])}]"
     before = [f"PYTHONPATH={shlex.quote(paths)}"] if paths else []
     options = ["--config-dir", config] if config else []
-    quoted = [shlex.quote(word) for word in [*options, *many, *words, seeds]]
+    quoted = [shlex.quote(word) for word in [*options, *many, *kept, seeds]]
     return " ".join([*before, "bin/train", *quoted])
 
 
@@ -211,17 +201,15 @@ def _joined(seeds: Sequence[int]) -> str:
 
 
 def _versions(run: Run) -> str:
-    found = run.facts.get("versions")
-    if not isinstance(found, dict):
-        return "not recorded"
-    return ", ".join(f"{str(name)[:40]} {str(value)[:40]}" for name, value in sorted(found.items()))
+    found = run.facts.get("versions", {})
+    return ", ".join(f"{name} {found[name]}" for name in sorted(found)) or "not recorded"
 
 
 def _hardware(run: Run) -> str:
     facts = [run.facts.get(name) for name in ("machine", "device")]
-    text = ", ".join(str(fact)[:120] for fact in facts if fact) or "not recorded"
+    text = ", ".join(filter(None, facts)) or "not recorded"
     threads = run.facts.get("threads")
-    return f"{text}, threads per operation: {threads}" if isinstance(threads, int) else text
+    return f"{text}, threads per operation: {threads}" if threads else text
 
 
 def _distinct(runs: Sequence[Run], text: Any) -> str:
@@ -255,6 +243,12 @@ def over_tasks(compared: arena.Arena, figures: str) -> str:
     return "\n\n".join(
         ["## Over all tasks", said, *_tables([summary]), picture, *_tables([by_task])]
     )
+
+
+def of_teachers(drawings: Sequence[Drawing], notes: Sequence[str], figures: str) -> str:
+    """Returns the Markdown on logs of teachers: notes and figures."""
+    pictures = [f"![{escape_markdown(one.title)}]({figures}{one.name}.png)" for one in drawings]
+    return "\n\n".join(["## Logs of teachers", *map(escape_markdown, notes), *pictures])
 
 
 def _tables(tables: Iterable[Table]) -> list[str]:

@@ -1,15 +1,10 @@
-"""Runs are read from their folders, or from a study's tables: nothing in either is trusted.
-
-Whatever is not as it should be raises :class:`UnreadableRun`, which names the folder and the file.
-"""
+"""Runs are read from their folders, or from a study's tables."""
 
 from __future__ import annotations
 
-import io
 import json
-import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,23 +14,18 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from proposer_rl.report.runs import COST, LARGEST_FILE, NAMES, STUDY, Run
-from proposer_rl.runs.folder import FAILURE, is_rate, read_bounded, read_csv, read_jsonl
+from proposer_rl.runs.folder import FAILURE, is_rate, read_csv, read_jsonl
 from proposer_rl.runs.records import (
     LARGEST,
     Column,
-    LevelResults,
-    Name,
+    LevelRecord,
     Record,
     SampleRecord,
-    Sheets,
     TaskFacts,
-    Text,
     checked,
-    number,
     printable,
 )
 
-MOST_FOLDERS = 20_000
 ROUNDING = 1e-5  # by which a share may lie outside of 0 to 1
 
 
@@ -77,12 +67,8 @@ def begun(folder: Path) -> list[Path]:
 def _walk(folder: Path) -> Iterator[tuple[Path, set[str]]]:
     """Yields folders of runs and studies with their files' names; skips links and hidden ones."""
     if not folder.is_dir():
-        is_file = "is no folder of runs; bin/report takes logs of teachers, *.jsonl, by themselves"
-        what = is_file if folder.exists() else "there is no such folder"
-        raise UnreadableRun(f"{folder}: {what}")
-    for seen, (root, names, files) in enumerate(os.walk(folder)):
-        if seen > MOST_FOLDERS:
-            raise UnreadableRun(f"{folder}: more than {MOST_FOLDERS} folders in it; name them")
+        raise UnreadableRun(f"{folder}: there is no such folder")
+    for root, names, files in os.walk(folder):
         # Hidden are those of a study that is being published.
         names[:] = sorted(name for name in names if not name.startswith("."))
         if {"config.json", STUDY} & set(files):
@@ -92,12 +78,14 @@ def _walk(folder: Path) -> Iterator[tuple[Path, set[str]]]:
 
 
 def read_run(folder: Path) -> list[Run]:
-    """Returns all seeds of a run's folder, or all runs of a study."""
+    """Returns all seeds of a run's folder, or all runs of a study.
+
+    Raises:
+        UnreadableRun: with what is wrong; a report leaves the folder out and says so.
+    """
     try:
-        if (folder / STUDY).exists():
-            return _read_study(folder)
-        return _read_folder(folder)
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
+        return _read_study(folder) if (folder / STUDY).exists() else _read_folder(folder)
+    except (OSError, ValueError, KeyError, TypeError) as error:
         missing = isinstance(error, KeyError)
         reason = f"an entry {error} is missing" if missing else str(error) or repr(error)
         raise UnreadableRun(f"{folder}: {printable(reason)[:300]}") from error
@@ -107,16 +95,16 @@ def _read_folder(folder: Path) -> list[Run]:
     pictures = folder / "curriculum.jsonl"
     # Of many seeds and evaluations they are too many; all else of the run can be shown.
     large = pictures.is_file() and pictures.stat().st_size > LARGEST_FILE
-    recorded = [] if large else _optional(folder, pictures.name, read_jsonl)
-    reached = _optional(folder, "levels.jsonl", read_jsonl)
+    recorded = [] if large else _optional(pictures, read_jsonl)
     return _runs(
         folder,
-        _read_json(folder, "config.json"),
-        (_read_json(folder, "run.json") or {}) | (_read_json(folder, "summary.json") or {}),
-        pd.DataFrame(read_csv(_checked(folder, "metrics.csv"))),
-        pd.DataFrame(_optional(folder, "training.csv", read_csv)),
-        _optional(folder, "cycles.jsonl", read_jsonl),
-        checked(list[LevelResults], reached, "levels.jsonl"),
+        _read_json(folder / "config.json"),
+        _read_json(folder / "run.json")
+        | ({} if not (folder / "summary.json").exists() else _read_json(folder / "summary.json")),
+        pd.DataFrame(read_csv(folder / "metrics.csv")),
+        pd.DataFrame(_optional(folder / "training.csv", read_csv)),
+        _optional(folder / "cycles.jsonl", read_jsonl),
+        _optional(folder / "levels.jsonl", read_jsonl),
         checked(list[SampleRecord], recorded, "curriculum.jsonl"),
     )
 
@@ -126,10 +114,7 @@ def _read_study(folder: Path) -> list[Run]:
     tables = {name: _by_run(folder, name) for name in NAMES}
     runs = []
     for row in _table(folder / STUDY).to_dict("records"):
-        name, config = row["run"], json.loads(row["config"])
-        facts = checked(dict[str, Any], json.loads(row["facts"]), f"{STUDY}: facts")
-        if ".." in Path(checked(Text, name, f"{STUDY}: run")).parts or Path(name).is_absolute():
-            raise ValueError(f"{STUDY}: {name} leads out of the study")
+        name = row["run"]
         metrics, training, cycles, levels = (
             tables[table].get(name, pd.DataFrame()) for table in NAMES
         )
@@ -139,8 +124,8 @@ def _read_study(folder: Path) -> list[Run]:
         ]
         runs += _runs(
             folder / name,
-            config,
-            facts,
+            json.loads(row["config"]),
+            json.loads(row["facts"]),
             metrics.astype(float),
             training.astype(float),
             recorded,
@@ -152,21 +137,10 @@ def _read_study(folder: Path) -> list[Run]:
 
 def _table(file: Path) -> pd.DataFrame:
     """Returns a table of a study with its cells as text, NaN for empty ones."""
-    import lzma  # which not every Python is built with
-
-    if file.is_symlink():
-        raise ValueError(f"{file.name} is not a plain file")
-    content = read_bounded(file, LARGEST_FILE)
-    unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=2 * LARGEST_FILE)
     try:
-        text = unpacker.decompress(content, LARGEST_FILE + 1)
-    except (lzma.LZMAError, EOFError) as error:
-        raise ValueError(f"{file.name} is not packed by xz: {error}") from None
-    if len(text) > LARGEST_FILE or not unpacker.eof:
-        raise ValueError(f"{file.name} is cut off, or larger than {LARGEST_FILE // 2**20} MiB")
-    return pd.read_csv(
-        io.BytesIO(text), dtype=str, keep_default_na=False, na_values=[""], index_col=False
-    )
+        return pd.read_csv(file, dtype=str, keep_default_na=False, na_values=[""], index_col=False)
+    except Exception as error:  # of xz, whose errors are of no common kind, or of pandas
+        raise ValueError(f"{file.name}: {error}") from error
 
 
 def _by_run(folder: Path, name: str) -> dict[str, pd.DataFrame]:
@@ -183,44 +157,35 @@ def _by_run(folder: Path, name: str) -> dict[str, pd.DataFrame]:
     }
 
 
-def _level_results(levels: pd.DataFrame) -> list[LevelResults]:
+def _level_results(levels: pd.DataFrame) -> list[Record]:
+    """Returns a study's rows of single levels as a folder has them: a record for each seed."""
     if not len(levels):
         return []
     place = ["seed", "updates", "distribution"]
-    values = levels.drop(columns=[*place, "level"]).astype(float)
-    numbers = {name: values[name].to_numpy() for name in values}
-    rows: dict[tuple[str, ...], list[int]] = {}
-    for row, key in enumerate(zip(*(levels[name].tolist() for name in place), strict=True)):
-        rows.setdefault(key, []).append(row)
     found = []
-    for (seed, updates, name), own in rows.items():
-        known = {kind: column[own] for kind, column in numbers.items()}
+    for (seed, updates, name), own in levels.groupby(place, sort=False):
         about = {"seed": int(seed), "updates": int(updates), "distribution": name}
-        about |= {kind: some.tolist() for kind, some in known.items() if not np.isnan(some).any()}
-        found.append(checked(LevelResults, about, "levels.csv.xz"))
+        known = own.drop(columns=[*place, "level"]).astype(float).dropna(axis=1)
+        found.append(about | known.to_dict("list"))
     return found
 
 
 def _runs(
     folder: Path,
-    config: dict[str, Any] | None,
+    config: dict[str, Any],
     facts: dict[str, Any],
     metrics: pd.DataFrame,
     training: pd.DataFrame,
     cycles: Sequence[Any],
-    levels: Sequence[LevelResults],
+    levels: Sequence[Record],
     samples: Sequence[SampleRecord],
 ) -> list[Run]:
     """Returns a run for each seed; ``facts`` have ``updates`` only of finished runs."""
-    config = _check_config(config)
-    task = checked(TaskFacts, facts["task"], "run.json: task")
     if not len(metrics):
         raise ValueError("metrics.csv has no rows yet")
-    if len(training) and "updates" not in training:
-        raise ValueError("training.csv has no column 'updates'")
-    if any(math.isnan(number(row["updates"])) for row in cycles):
-        raise ValueError("cycles.jsonl: updates is no number")
-    sheets = [checked(Sheets, row.pop("levels", {}), "cycles.jsonl: levels") for row in cycles]
+    task = checked(TaskFacts, facts["task"], "run.json: task")
+    pictured = dict[str, list[LevelRecord]]
+    sheets = [checked(pictured, row.pop("levels", {}), "cycles.jsonl: levels") for row in cycles]
     seeds = sorted(metrics["seed"].astype(int).unique().tolist())
     runs = []
     for seed in seeds:
@@ -244,54 +209,27 @@ def _runs(
     return runs
 
 
-def _checked(folder: Path, name: str) -> Path:
-    path = folder / name
-    if path.is_symlink() or not path.is_file():
-        raise ValueError(f"{name} is not a plain file")
-    if path.stat().st_size > LARGEST_FILE:
-        raise ValueError(f"{name} is larger than {LARGEST_FILE // 2**20} MiB")
-    return path
+def _optional(file: Path, read: Callable[[Path], list[Any]]) -> list[Any]:
+    return read(file) if file.exists() else []
 
 
-def _optional(folder: Path, name: str, read: Any) -> list[Any]:
-    return read(_checked(folder, name)) if (folder / name).exists() else []
-
-
-def _read_json(folder: Path, name: str) -> dict[str, Any] | None:
-    if not (folder / name).exists():
-        return None
-    content = _checked(folder, name).read_bytes()
+def _read_json(file: Path) -> dict[str, Any]:
     try:
-        value = json.loads(content)
+        value = json.loads(file.read_text("utf-8-sig"))  # with the mark of editors of Windows
     except ValueError as error:
-        raise ValueError(f"{name} is no JSON: {error}") from None
-    if not isinstance(value, dict):
-        raise ValueError(f"{name} is not a JSON object")
-    return value
+        raise ValueError(f"{file.name}: {error}") from error
+    return checked(dict[str, Any], value, file.name)
 
 
-def _check_config(config: dict[str, Any] | None) -> dict[str, Any]:
-    if config is None:
-        raise ValueError("there is no config.json")
-    checked(Name, config["method"], "config.json: method")
-    for name in ("scale", "ablation"):
-        checked(Name, config.get(name, "none"), f"config.json: {name}")
-    checked(Name, config["schedule"]["headline"], "config.json: schedule.headline")
-    threshold = config["schedule"]["threshold"]
-    if isinstance(threshold, list) or math.isnan(number(threshold)):
-        raise ValueError("config.json: schedule.threshold is no number")
-    return config
-
-
-def _levels(rows: Sequence[LevelResults], seed: int, updates: int) -> dict[str, Column]:
+def _levels(rows: Sequence[Record], seed: int, updates: int) -> dict[str, Column]:
     """Returns what a seed reached on every level after that many updates, [levels] by column."""
     found = {}
     for row in rows:
-        if (row.seed, row.updates) == (seed, updates):
-            for kind, values in (("success", row.success), ("return", row.returns)):
-                if values is not None:
-                    name = f"{row.distribution}_{kind}"
-                    found[name] = _rounded(is_rate(name), np.array(values, float))
+        if (row["seed"], row["updates"]) == (seed, updates):
+            for kind in ("success", "return"):
+                if row.get(kind) is not None:
+                    name = f"{row['distribution']}_{kind}"
+                    found[name] = _rounded(is_rate(name), np.array(row[kind], float))
     return found
 
 
@@ -310,18 +248,17 @@ def _rounded(rate: bool | NDArray[np.bool_], values: Column) -> Column:
 def _of_seed(table: pd.DataFrame, seed: int) -> pd.DataFrame:
     if not len(table):
         return table
-    names = [checked(Name, name, "the name of a column") for name in table.columns.drop("seed")]
+    names = [*table.columns.drop("seed")]
     values = table[names].to_numpy(float)[table["seed"].to_numpy() == seed]
     known = np.where(np.abs(values) < LARGEST, values, np.nan)
     return pd.DataFrame(_rounded(np.array([*map(is_rate, names)], bool), known), columns=names)
 
 
 def _check_metrics(run: Run) -> None:
-    unknown = run.metrics.isna().any()
-    for name in sorted({*COST, *run.measurements, run.headline}):
-        if name not in unknown:
-            raise ValueError(f"metrics.csv has no column {name!r}")
-        if unknown[name]:
-            raise ValueError(f"metrics.csv: {name} is not always a number")
+    """Refuses what would make every comparison wrong in silence."""
+    needed = {*COST, *run.measurements, run.headline}
+    unknown = run.metrics.reindex(columns=sorted(needed)).isna().any()
+    if unknown.any():
+        raise ValueError(f"metrics.csv: {unknown.idxmax()} is not always a number")
     if (np.diff(run.metrics["updates"]) <= 0).any():
         raise ValueError("metrics.csv: updates do not grow from row to row")

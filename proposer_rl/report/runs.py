@@ -38,7 +38,7 @@ OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_n
 _STUDENT = re.compile(r"lifetime_(\d{1,9})")
 STUDY = "runs.csv.xz"  # what makes a folder a study's
 NAMES = ("metrics", "training", "cycles", "levels")
-LARGEST_FILE = 64 * 2**20  # bytes, unpacked
+LARGEST_FILE = 64 * 2**20  # bytes of pictures that are read
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,8 @@ class Run:
     @property
     def planned(self) -> int | None:
         """Updates that the run shall have; None where the folder does not say."""
-        value = self.facts.get("planned_updates", self.facts.get("updates"))
-        return value if isinstance(value, int) else None
+        value: int | None = self.facts.get("planned_updates", self.facts.get("updates"))
+        return value
 
     @cached_property
     def columns(self) -> Mapping[str, Column]:
@@ -205,7 +205,7 @@ class Run:
         sides = tuple(len(values) for values in self.task.space.values())
         try:
             counts = np.asarray(cycle.get("histogram"), float)
-        except (ValueError, TypeError, OverflowError):
+        except (ValueError, TypeError):
             return None
         if not sides or counts.shape != sides or not (counts >= 0).all():
             return None

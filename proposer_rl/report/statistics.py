@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,6 @@ ERROR = 1 - CONFIDENCE  # how often a test may be wrong
 HELD = 0.93  # how often at least an interval of a median holds it; five runs give 0.9375
 MOST_SEEDS = 1_000_000  # more say that there is no difference to be found
 FEWEST = 5  # runs for an interval
-QUARTER = 0.25
 POWER = 0.8
 
 # What is said of numbers of a method, for a reader.
@@ -154,31 +153,6 @@ def median_of(values: Values) -> tuple[Any, Any, Any]:
 def median_interval(values: Values) -> Interval:
     """Returns the median of independent values with its interval: see :func:`median_of`."""
     return Interval(*map(float, median_of(values)))
-
-
-def interquartile_mean(values: Values) -> float:
-    """Returns the mean of the middle half of the values (Agarwal et al., NeurIPS 2021)."""
-    return float(scipy.stats.trim_mean(np.asarray(values, dtype=float), QUARTER, axis=None))
-
-
-def jackknife(
-    statistic: Callable[[NDArray[np.float64]], float], rows: NDArray[np.float64]
-) -> Interval:
-    """Returns a statistic of independent rows, with the jackknife's interval over them.
-
-    Student's interval of the pseudo-values n θ - (n - 1) θ without row i (Tukey, Annals of
-    Mathematical Statistics 29, 1958).
-
-    Args:
-        statistic: of any number of rows, smooth.
-        rows: float [n, ...].
-    """
-    count, whole = len(rows), statistic(rows)
-    if count < FEWEST:
-        return Interval(whole, math.nan, math.nan)
-    without = np.array([statistic(np.delete(rows, i, 0)) for i in range(count)])
-    _, error, freedom = mean_of(count * whole - (count - 1) * without)
-    return Estimate(whole, error, freedom).interval()
 
 
 def probability_of_improvement(one: Values, other: Values) -> Interval:

@@ -294,10 +294,10 @@ def _labels(plain: str, alike: Sequence[Sequence[Run]]) -> list[tuple[str, str]]
 def _overrides(run: Run) -> list[str] | None:
     """Returns a run's overrides without its method and those that leave its outcome alone."""
     given = run.facts.get("overrides")
-    if not isinstance(given, list) or not all(isinstance(word, str) for word in given):
+    if given is None:
         return None
-    words = [word.lstrip("+") for word in given if not word.lstrip("+").startswith(ASIDE)]
-    return [word for word in words if word.isprintable()]
+    words = [word.lstrip("+") for word in given]
+    return [word for word in words if not word.startswith(ASIDE)]
 
 
 def _differing(leaves: Sequence[Mapping[str, str]]) -> list[str]:

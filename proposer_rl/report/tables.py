@@ -26,21 +26,27 @@ class Table:
         title: above it.
         note: what must be known to read it.
         rows: each from a column's title to the cell; None for an empty one.
+        aside: titles of the columns that are in the CSV alone.
     """
 
     name: str
     title: str
     note: str
     rows: Sequence[Mapping[str, Cell]]
+    aside: Sequence[str] = ()
 
     @property
     def columns(self) -> list[str]:
-        """Titles of the columns."""
+        """Titles of the columns that a reader sees."""
+        return [name for name in self._all if name not in self.aside]
+
+    @property
+    def _all(self) -> list[str]:
         return list(self.rows[0]) if self.rows else []
 
     def texts(self) -> list[list[str]]:
         """Returns the cells as text for a reader, [rows][columns]."""
-        return [[write(cell) for cell in row.values()] for row in self.rows]
+        return [[write(row[name]) for name in self.columns] for row in self.rows]
 
     def to_markdown(self) -> str:
         """Returns the table in GitHub's Markdown."""
@@ -50,7 +56,7 @@ class Table:
     def to_csv(self) -> str:
         """Returns the cells' numbers as CSV; an interval takes three columns."""
         columns: dict[str, list[Any]] = {}
-        for name in self.columns:
+        for name in self._all:
             cells = [row[name] for row in self.rows]
             columns[name] = [c.estimate if isinstance(c, Interval) else c for c in cells]
             if any(isinstance(cell, Interval) for cell in cells):

@@ -1,109 +1,147 @@
-"""A page of the logs of teachers in loops of one's own, as ``Teacher.log(file)`` writes them."""
+"""Logs that ``Teacher.log(file)`` writes in loops of one's own, and their figures."""
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
 from matplotlib.figure import FigureBase
 
-from proposer_rl.report.build import check_output
 from proposer_rl.report.reading import UnreadableRun
-from proposer_rl.report.runs import LARGEST_FILE
-from proposer_rl.report.style import Drawing, Look, finish, looks, render, style
-from proposer_rl.runs.folder import read_jsonl, write_atomically
-from proposer_rl.runs.records import LARGEST, Column, batch_shares, printable
+from proposer_rl.report.style import Drawing, Look, finish, looks, style
+from proposer_rl.runs.folder import read_jsonl
+from proposer_rl.runs.records import LARGEST, Column, Record, batch_shares, printable
 
-PAGE = "teachers.html"
 COMMON = ("mean_return", "mean_success", "proposed", "told", "dropped", "out")
+# No entries that are curves: counts by bin, the curriculum's own count of them, and what a line is
+# of and where it is.
+ASIDE = ("drawn", "histogram", "teacher", "levels_told")
 MOST_PANELS = 24  # of entries, and of parameters
 MOST_TICKS = 16
 X = "levels told"
 
-TEMPLATE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>Logs of teachers</title>
-<style>body{font:16px/1.5 sans-serif;max-width:75rem;margin:2rem auto;padding:0 1rem}
-img{max-width:100%}</style></head><body>
-<h1>Logs of teachers</h1>
-{% for drawing, content in figures %}
-<h2>{{ drawing.title }}</h2>
-<img alt="{{ drawing.title }}" src="data:image/png;base64,{{ content }}">
-<p>{{ drawing.caption }}</p>
-{% endfor %}
-</body></html>
-"""
+
+class Log:
+    """Lines of a log.
+
+    Args:
+        rows: the lines. ``teacher`` says whose each is, and ``levels_told`` how many levels that
+            teacher had been told since it began; without either, they are of one teacher.
+    """
+
+    def __init__(self, rows: Sequence[Record]) -> None:
+        self.rows = rows
+
+    @cached_property
+    def x(self) -> Column:
+        """How many levels the line's teacher had been told, float [m]."""
+        found, told = [], dict[Any, float]()
+        for row in self.rows:
+            whose = row.get("teacher")
+            told[whose] = row.get("levels_told", told.get(whose, 0) + row["told"])
+            found.append(float(told[whose]))
+        return np.array(found)
+
+    @cached_property
+    def entries(self) -> dict[str, Column]:
+        """Numbers by name, NaN where there is none; of several in an entry the mean, float [m]."""
+        rows = [
+            {**row, **{f"share: {name}": share for name, share in batch_shares(row).items()}}
+            for row in self.rows
+        ]
+        names = dict.fromkeys([*COMMON, *(name for row in rows for name in row)])
+        found = {
+            name: np.array([_mean(row.get(name)) for row in rows])
+            for name in names
+            if name not in ASIDE
+        }
+        return {name: values for name, values in found.items() if np.isfinite(values).any()}
+
+    @cached_property
+    def drawn(self) -> dict[str, tuple[list[str], Column]]:
+        """By parameter the names of its bins, and the shares of the proposed levels, [m, n]."""
+        found = {}
+        for name, bins in self.rows[0]["drawn"].items():
+            counts = np.array([[*row["drawn"][name].values()] for row in self.rows], float)
+            found[name] = [*bins], counts / counts.sum(1, keepdims=True).clip(1)
+        return found
+
+    def curves(self) -> dict[str, Log]:
+        """Returns the lines of each teacher, from each state that a loop went on from.
+
+        Returns:
+            By what tells them apart; a log that is one curve by the empty text.
+        """
+        parts: dict[tuple[Any, int], list[Record]] = {}
+        starts: dict[tuple[Any, int], float] = {}
+        last: dict[Any, tuple[int, float]] = {}
+        for row, x in zip(self.rows, self.x.tolist(), strict=True):
+            whose, start = row.get("teacher"), x - row["told"]
+            part, before = last.get(whose, (1, 0.0))
+            if start < before:  # the loop went on from an earlier state than its last line's
+                part += 1
+            last[whose] = part, x
+            parts.setdefault((whose, part), []).append(row)
+            starts.setdefault((whose, part), start)
+        found = {}
+        for (whose, part), rows in parts.items():
+            names = [f"teacher {whose}"] if len(last) > 1 else []
+            if part > 1:
+                names.append(f"part {part}, from {starts[whose, part]:g} levels on")
+            found[", ".join(names)] = Log(rows)
+        return found
 
 
-class Log(NamedTuple):
-    """A teacher's log: its entries over the number of levels that had been told.
+class Curves(NamedTuple):
+    """The curves of some logs.
 
     Attributes:
-        x: levels told, float [m].
-        entries: numbers by name, NaN where there is none; means over students or bins, float [m].
-        drawn: by parameter, the names of its bins and the shares of the levels, float [m, n].
+        logs: by their labels.
+        notes: on files that are more than one curve.
     """
 
-    x: Column
-    entries: dict[str, Column]
-    drawn: dict[str, tuple[list[str], Column]]
-
-
-def write_teachers(files: Sequence[Path], output: Path) -> Path:
-    """Writes a page of some logs into a folder, and returns its path.
-
-    Raises:
-        UnreadableRun: for a file that is no such log.
-        OutputError: if the folder has files of somebody else.
-    """
-    logs = {}
-    for file in files:
-        name = printable(file.stem)[:80]
-        # What tells two paths from each other stands rather at their ends.
-        logs[name if name not in logs else printable(str(file))[-80:]] = read_log(file)
-    check_output(output, PAGE, "report.html")
-    output.mkdir(parents=True, exist_ok=True)
-    figures = [
-        (drawing, base64.b64encode(*render(drawing, "png")).decode()) for drawing in drawings(logs)
-    ]
-    template = Environment(autoescape=True, undefined=StrictUndefined).from_string(TEMPLATE)
-    write_atomically(output / PAGE, template.render(figures=figures).encode())
-    return output / PAGE
+    logs: dict[str, Log]
+    notes: list[str]
 
 
 def read_log(file: Path) -> Log:
-    """Reads a log from a file, which is not trusted.
+    """Reads a log from a file.
 
     Raises:
         UnreadableRun: naming the file.
     """
     try:
-        if file.stat().st_size > LARGEST_FILE:
-            raise ValueError(f"is larger than {LARGEST_FILE:,} bytes")
         rows: Sequence[dict[str, Any]] = read_jsonl(file)
-        if not rows or not all("told" in row and "drawn" in row for row in rows):
-            raise ValueError("is no log of a teacher, as teacher.log(file) writes it")
-        rows = [row | {f"share: {n}": s for n, s in batch_shares(row).items()} for row in rows]
-        names = dict.fromkeys([*COMMON, *(name for row in rows for name in row)])
-        entries = {
-            name: np.array([_mean(row.get(name)) for row in rows])
-            for name in names
-            if name not in ("drawn", "histogram")  # the curriculum's own count of the former
-        }
-        drawn = {}
-        for name in rows[0]["drawn"]:
-            bins = list(rows[0]["drawn"][name])
-            counts = np.array([[float(row["drawn"][name][one]) for one in bins] for row in rows])
-            drawn[name] = bins, counts / counts.sum(1, keepdims=True).clip(1)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UnreadableRun(f"{file}: {printable(str(error))[:300]}") from error
-    known = {name: values for name, values in entries.items() if np.isfinite(values).any()}
-    return Log(np.nan_to_num(entries["told"]).cumsum(), known, drawn)
+    except (OSError, ValueError) as error:
+        raise UnreadableRun(f"{file}: {printable(str(error))}") from error
+    if not rows or not all("told" in row and "drawn" in row for row in rows):
+        raise UnreadableRun(f"{file}: is no log of a teacher, as teacher.log(file) writes it")
+    return Log(rows)
+
+
+def read_curves(files: Sequence[Path]) -> Curves:
+    """Reads logs, and tells their teachers apart.
+
+    Raises:
+        UnreadableRun: for a file that is no such log.
+    """
+    logs: dict[str, Log] = {}
+    notes = []
+    for file in files:
+        stems = [other.stem for other in files]
+        label = file.stem if stems.count(file.stem) == 1 else str(file)
+        found = read_log(file).curves()
+        logs |= {", ".join(filter(None, [label, name])): log for name, log in found.items()}
+        if len(found) > 1:
+            notes.append(
+                f"{label} has {len(found)} curves, since several teachers have written to it, or a "
+                "loop has gone on from an earlier state."
+            )
+    return Curves(logs, notes)
 
 
 def drawings(logs: Mapping[str, Log]) -> list[Drawing]:
@@ -113,21 +151,21 @@ def drawings(logs: Mapping[str, Log]) -> list[Drawing]:
     panels = [partial(_draw_entry, logs=logs, name=name, named=named) for name in names]
     found = [
         Drawing(
-            "entries",
+            "teachers",
             "What came of the levels, and what the curricula tell",
             "A point for each line of a log: what happened since the line before it. Of entries of "
-            f"several students or bins the mean. The first {MOST_PANELS} entries.",
+            f"several numbers the mean. The first {MOST_PANELS} entries.",
             panels[:MOST_PANELS],
             3,
             named,
         )
     ]
-    for label, log in logs.items():
+    for number, (label, log) in enumerate(logs.items(), 1):
         maps = [partial(_draw_map, log=log, name=name) for name in log.drawn]
         if maps:
             found.append(
                 Drawing(
-                    "drawn",
+                    f"teachers_levels_{number}",
                     f"Levels that were proposed: {label}",
                     "Shares of the bins of each parameter, line by line; the darker, the more.",
                     maps[:MOST_PANELS],

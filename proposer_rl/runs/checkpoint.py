@@ -17,16 +17,14 @@ import json
 import logging
 import os
 import re
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from proposer_rl.runs.folder import PROPOSER, read_bounded, storage, write_atomically
+from proposer_rl.runs.folder import PROPOSER, storage, write_atomically
 
 FORMAT = 2
-LARGEST = 2**36  # bytes
 
 _LOG = logging.getLogger(__name__)
 _FILE_NAME = re.compile(r"step_(\d+)\.pt")
@@ -50,7 +48,8 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: State, kee
 
     Args:
         folder: where checkpoints lie; created if it does not exist.
-        step: the run's step, not negative. A checkpoint of the same step is replaced.
+        step: the run's step. A checkpoint of the same step is replaced; later ones, which the run
+            did not go on from since they are damaged, are removed.
         state: nested dicts, lists and tuples of tensors, numbers, text and None. Tensors are
             written detached and from the CPU, so that a run can go on on another device.
         keep: how many of the newest checkpoints stay.
@@ -59,34 +58,24 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: State, kee
         The checkpoint's file.
 
     Raises:
-        CheckpointError: if the state holds anything else, or the folder already holds an intact
-            checkpoint of a later step: then it is another run's folder, or this run was not resumed
-            from it.
+        CheckpointError: if the state holds anything else.
         StorageError: if the disk cannot take it. In either case the checkpoints that were there
             stay as they were.
     """
-    if step < 0 or keep < 1:
-        raise CheckpointError(f"step must be at least 0 and keep at least 1, got {step} and {keep}")
     folder = Path(folder)
     path = folder / f"step_{step:09d}.pt"
     content = checkpoint_bytes(step, state)
-    later = [old for number, old in checkpoint_files(folder) if number > step]
-    for old in later:  # all of them damaged, or else this run is not theirs
-        with suppress(_DamagedError):
-            _verified(old)
-            raise CheckpointError(
-                f"{old} is later than step {step}: resume from it, or use another folder"
-            )
     with storage(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for leftover in folder.glob(".step_*.pt.tmp"):
             leftover.unlink()
     write_atomically(path, content)
     with storage(folder):
-        for old in later:
-            old.unlink()
-        for _, old in checkpoint_files(folder)[:-keep]:
-            old.unlink()
+        files = checkpoint_files(folder)
+        kept = [old for number, old in files if number <= step][-keep:]
+        for _, old in files:
+            if old not in kept:
+                old.unlink()
     return path
 
 
@@ -137,23 +126,28 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[int, State]:
             holds more than plain data (reading it would then run code).
         StorageError: if the file cannot be read.
     """
-    version, step, payload = _verified(Path(path))
-    if version != FORMAT:
-        age = "a newer" if version > FORMAT else "an older"
-        raise CheckpointError(
-            f"the checkpoint {path} has format {version}, this version of proposer_rl reads only "
-            f"format {FORMAT}: go on with {age} version, or start in another folder"
+    path = Path(path)
+    with storage(path, "read"):
+        content = path.read_bytes()
+    digest, _, body = content.partition(b"\n")
+    if digest != hashlib.sha256(body).hexdigest().encode():  # before anything is looked at
+        raise _DamagedError(
+            f"the checkpoint {path} is damaged ({len(content)} bytes, wrong checksum)"
         )
+    line, _, payload = body.partition(b"\n")
     try:
-        state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
-    except Exception:  # whatever torch raises, what it read is not a state that we wrote
-        state = None  # what it says ends in advice on how to run the code that may be in it
-    if not isinstance(state, dict):
+        header = json.loads(line)
+        version, step = int(header["format"]), int(header["step"])
+        if version == FORMAT:
+            return step, torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
+    except Exception as error:  # whose text ends in advice on how to run code that may be in it
         raise CheckpointError(
-            f"the checkpoint {path} is refused by torch.load: it holds more than tensors and plain "
-            "data, and was not written by proposer_rl"
-        )
-    return step, state
+            f"{path} is not a checkpoint of proposer_rl: it must hold tensors and plain data alone"
+        ) from error
+    raise CheckpointError(
+        f"the checkpoint {path} has format {version}, this version of proposer_rl reads only "
+        f"format {FORMAT}: go on with the version that wrote it, or start in another folder"
+    )
 
 
 def learnt_curriculum(path: Path) -> State:
@@ -192,24 +186,3 @@ def _plain(value: object, where: str) -> object:
         f"{where} is a {type(value).__name__}; a checkpoint holds dicts, lists, tuples, tensors, "
         "numbers, text and None"
     )
-
-
-def _verified(path: Path) -> tuple[int, int, bytes]:
-    """Returns format, step and payload of a file, none of them looked at before the checksum."""
-    try:
-        content = read_bounded(path, LARGEST)
-    except ValueError as error:
-        raise CheckpointError(str(error)) from error
-    digest, _, body = content.partition(b"\n")
-    if digest != hashlib.sha256(body).hexdigest().encode():
-        raise _DamagedError(
-            f"the checkpoint {path} is damaged ({len(content)} bytes, wrong checksum)"
-        )
-    line, _, payload = body.partition(b"\n")
-    try:
-        match json.loads(line):
-            case {"format": int(version), "step": int(step)}:
-                return version, step, payload
-    except (ValueError, RecursionError):
-        pass
-    raise CheckpointError(f"{path} is not a checkpoint of proposer_rl")

@@ -9,14 +9,15 @@ without its newline is a row that a crash interrupted: readers skip it, and
 
 from __future__ import annotations
 
+import errno
 import json
 import os
-import re
-import stat
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from itertools import accumulate
 from pathlib import Path
+from typing import Any
 
 Number = int | float
 
@@ -26,8 +27,6 @@ FAILURE = "error.json"  # what a sweep leaves in the folder of a run that failed
 PROPOSER = "proposer.pt"  # what a run's curriculum has learnt, alone: a checkpoint without Solvers
 # By how much a mean may miss a threshold that it reached: 18 of 20 in float32 is 0.89999998.
 SLACK = 1e-6
-
-_PLAIN_NAME = re.compile(r"[^\s\",][^\r\n\",]*")
 
 
 class StorageError(OSError):
@@ -57,14 +56,14 @@ class RunFolder:
                 first row makes the header); for ``.jsonl`` whatever JSON can hold.
 
         Raises:
-            ValueError: if the name is not a table's, a value cannot be written, the keys are not
-                those of the header, or the table ends in the middle of a row.
+            ValueError: if a value is no number, or the keys are not those of the header.
+            TypeError: if JSON cannot hold it.
             StorageError: if the disk does not take the row.
         """
-        path = self._table(name)
+        path = self.path / name
         with storage(path):
             first = _first_line(path)
-            lines = _json(path, dict(row)) if path.suffix == ".jsonl" else _csv(path, row, first)
+            lines = json.dumps(dict(row)) if path.suffix == ".jsonl" else _csv(path, row, first)
             _write(path, "ab", (lines + "\n").encode())
             if first is None:
                 _sync_folder(self.path)
@@ -84,14 +83,13 @@ class RunFolder:
             StorageError: if a table cannot be changed.
         """
         sizes = {}
-        for name, rows in lengths.items():
-            path = self._table(name)
-            ends = _row_ends(path) if path.is_file() else []
+        for path in map(self.path.joinpath, TABLES):
+            rows, ends = lengths.get(path.name, 0), _row_ends(path) if path.is_file() else []
             if len(ends) < rows:
                 raise ValueError(f"{path} has {len(ends)} rows, fewer than the {rows} to be kept")
-            sizes[name] = ends[rows - 1] if rows else 0
+            sizes[path] = ends[rows - 1] if rows else 0
         for path in self._tables():
-            size = sizes.get(path.name, 0)
+            size = sizes[path]
             with storage(path):
                 if size == 0:
                     path.unlink()
@@ -103,13 +101,7 @@ class RunFolder:
 
     def write_json(self, name: str, value: object) -> None:
         """Writes a JSON file; a reader sees the old content or the new, never a part."""
-        path = self.path / name
-        write_atomically(path, (_json(path, value, indent=2) + "\n").encode())
-
-    def _table(self, name: str) -> Path:
-        if name not in TABLES:
-            raise ValueError(f"a table is one of {', '.join(TABLES)}, not {name!r}")
-        return self.path / name
+        write_atomically(self.path / name, (json.dumps(value, indent=2) + "\n").encode())
 
     def _tables(self) -> list[Path]:
         return [path for path in map(self.path.joinpath, TABLES) if path.is_file()]
@@ -126,7 +118,12 @@ def can_reach(name: str, threshold: float) -> bool:
 
 
 def read_csv(path: str | os.PathLike[str]) -> list[dict[str, Number]]:
-    """Returns the complete rows of a ``.csv`` table, as :meth:`RunFolder.append` was given them."""
+    """Returns the complete rows of a ``.csv`` table, as :meth:`RunFolder.append` was given them.
+
+    Raises:
+        ValueError: naming the file and the line that is no such row.
+        FileNotFoundError: if there is no such file.
+    """
     rows: list[dict[str, Number]] = []
     lines = _lines(Path(path))
     header = next(lines, ("", ""))[1].split(",")
@@ -138,18 +135,20 @@ def read_csv(path: str | os.PathLike[str]) -> list[dict[str, Number]]:
     return rows
 
 
-def read_jsonl(path: str | os.PathLike[str]) -> list[dict[str, object]]:
+def read_jsonl(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
     """Returns the complete rows of a ``.jsonl`` table; a ValueError names any other line."""
     rows = []
     for place, line in _lines(Path(path)):
         try:
-            row = json.loads(line)
-        except (json.JSONDecodeError, RecursionError) as error:
-            raise ValueError(f"{place}: not JSON: {error}") from None
-        if not isinstance(row, dict):
-            raise ValueError(f"{place}: not a JSON object: {line[:60]}")
-        rows.append(row)
+            rows.append(dict(json.loads(line)))
+        except (TypeError, ValueError, RecursionError) as error:
+            raise ValueError(f"{place}: not a JSON object: {error}") from None
     return rows
+
+
+def read_table(path: Path) -> Sequence[Mapping[str, Any]]:
+    """Returns the complete rows of either kind of table."""
+    return read_csv(path) if path.suffix == ".csv" else read_jsonl(path)
 
 
 def write_atomically(path: Path, content: bytes, durably: bool = True) -> None:
@@ -180,18 +179,9 @@ def write_atomically(path: Path, content: bytes, durably: bool = True) -> None:
 
 
 def read_bounded(path: Path, largest: int) -> bytes:
-    """Returns the content of a file that is not trusted.
-
-    Raises:
-        ValueError: if it has more than ``largest`` bytes, or is no file but a pipe or a device,
-            which might never end.
-        StorageError: if it cannot be read.
-    """
+    """Returns the content of a file; a ValueError says where it has more than ``largest`` bytes."""
     with storage(path, "read"):
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode):
-            raise ValueError(f"{path}: is no plain file")
-        if found.st_size > largest:
+        if path.stat().st_size > largest:
             raise ValueError(f"{path}: is larger than {largest:,} bytes")
         return path.read_bytes()
 
@@ -212,14 +202,11 @@ def storage(path: Path, action: str = "write") -> Iterator[None]:
 def _csv(path: Path, row: Mapping[str, object], header: str | None) -> str:
     """Returns a row as text, in the header's order; with a header if there is none yet."""
     columns = list(row) if header is None else header.split(",")
-    if set(row) != set(columns):
-        missing, unknown = sorted(set(columns) - set(row)), sorted(set(row) - set(columns))
-        raise ValueError(f"{path}: a row's columns differ: missing {missing}, unknown {unknown}")
-    if not columns:
-        raise ValueError(f"{path}: a row has no columns")
-    for name in columns if header is None else ():
-        if not _PLAIN_NAME.fullmatch(name):
-            raise ValueError(f"{path}: {name!r} cannot be a column: no commas, quotes, line breaks")
+    if set(row) != set(columns) or any(set(name) & set(',"\r\n') for name in columns):
+        raise ValueError(
+            f"{path}: a row has {', '.join(row)}; its columns are {', '.join(columns)}, and have "
+            "no commas, quotes or line breaks in their names"
+        )
     line = ",".join(_cell(path, name, row[name]) for name in columns)
     return line if header is not None else ",".join(columns) + "\n" + line
 
@@ -229,9 +216,7 @@ def _cell(path: Path, column: str, value: object) -> str:
         return float.__repr__(value)  # the shortest text that reads back as the same number
     if isinstance(value, int) and not isinstance(value, bool):
         return int.__repr__(value)
-    raise ValueError(
-        f"{path}: column {column!r} takes int or float, not {value!r} ({type(value).__name__})"
-    )
+    raise ValueError(f"{path}: {column} must be an int or a float, got {value!r}")
 
 
 def _number(place: str, text: str) -> Number:
@@ -241,37 +226,24 @@ def _number(place: str, text: str) -> Number:
     raise ValueError(f"{place}: {text!r} is not a number")
 
 
-def _json(path: Path, value: object, indent: int | None = None) -> str:
-    try:
-        return json.dumps(value, indent=indent)
-    except TypeError as error:
-        raise ValueError(f"{path}: {error}") from None
-
-
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Yields each complete line, after words that say where it is."""
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no table {path}")
+    """Yields each complete line, after words that say where it is.
+
+    Line ends of Windows, and the mark that editors there put in front, are no part of it.
+    """
     with open(path, "rb") as file:
         for number, line in enumerate(file, 1):
             if line.endswith(b"\n"):
                 place = f"{path}, line {number}"
                 try:
-                    yield place, line[:-1].decode()
+                    yield place, line.decode("utf-8-sig").rstrip("\r\n")
                 except UnicodeDecodeError as error:
                     raise ValueError(f"{place}: {error}") from None
 
 
 def _first_line(path: Path) -> str | None:
-    """Returns the first line of a table whose last one is complete; None without a line."""
-    if not path.exists() or not path.stat().st_size:
-        return None
-    with open(path, "rb") as file:
-        first = file.readline()
-        file.seek(-1, os.SEEK_END)
-        if file.read() != b"\n":
-            raise ValueError(f"{path} ends in the middle of a row; cut it back first")
-    return first.decode().rstrip("\n")
+    """Returns the first line of a table; None without one."""
+    return next((line for _, line in _lines(path)), None) if path.exists() else None
 
 
 def _row_ends(path: Path) -> list[int]:
@@ -291,9 +263,22 @@ def _write(path: Path, mode: str, content: bytes, durably: bool = True) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Waits until the names in a folder are on the disk: a rename is not before that."""
-    descriptor = os.open(folder, os.O_RDONLY)
+    """Waits until the names in a folder are on the disk: a rename is not before that.
+
+    Some file systems cannot do it, and Windows cannot open folders; what is in the files is on the
+    disk all the same.
+    """
     try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES):
+            raise
+        warnings.warn(
+            f"folders cannot be synced here ({error.strerror}): all files are written and synced, "
+            "but if the machine crashes, the newest may lack their names",
+            stacklevel=1,  # told once, whoever writes
+        )

@@ -1,4 +1,4 @@
-"""The process of a run: signals that ask it to stop, its folder's lock, what it is doing, where."""
+"""The process of a run: its output, signals that stop it, its folder's lock, what it is doing."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import os
 import platform
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -13,29 +14,84 @@ from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TextIO
 
 from filelock import FileLock, Timeout
 
 from proposer_rl.runs.folder import storage, write_atomically
 
 # Ctrl-C; the polite kill; a closed terminal; what Slurm and submitit send before a job is
-# pre-empted or runs out of time.
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
+# pre-empted or runs out of time. Windows has the first two.
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1", "SIGUSR2")
+STOP_SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 PROGRESS = "progress.json"
 EVERY = 1.0  # seconds between two writes
+
+
+class Output:
+    """Wraps a text stream so that writing to it never raises.
+
+    A terminal may close, or the reader of a pipe end, while a run has hours to go: what it prints
+    is lost then, and nothing else. Characters that the stream's encoding lacks become ``?``.
+
+    Args:
+        stream: what is written to; None, as Python has it for a closed descriptor, for nothing.
+    """
+
+    def __init__(self, stream: TextIO | None) -> None:
+        # The null device takes the closed descriptor's number, which a run's file must not get.
+        self._stream = stream or open(os.devnull, "w")  # noqa: SIM115  open as long as the process
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def __eq__(self, other: object) -> bool:
+        # So that tqdm knows its stream, and clears the bars on it before it writes a text there.
+        return other is self or other is self._stream or NotImplemented
+
+    __hash__ = object.__hash__
+
+    def write(self, text: str) -> int:
+        """Writes a text if somebody takes it."""
+        encoding = getattr(self._stream, "encoding", None) or "utf-8"
+        with suppress(OSError, ValueError):
+            self._stream.write(text.encode(encoding, "replace").decode(encoding))
+        return len(text)
+
+    def flush(self) -> None:
+        """Passes on what a buffer holds if somebody takes it."""
+        with suppress(OSError, ValueError):
+            self._stream.flush()
+
+
+def guard_output() -> None:
+    """Makes the process's standard output and error streams that never raise."""
+    for name in ("stdout", "stderr"):
+        if not isinstance(stream := getattr(sys, name), Output):
+            setattr(sys, name, Output(stream))
 
 
 class Interrupted(Exception):
     """The run was asked to stop, and has saved what is needed to go on.
 
-    Attributes:
+    Args:
         signum: the signal.
+
+    Attributes:
+        folder: where the run lies; None where that is not known.
     """
 
+    folder: Path | None = None
+
     def __init__(self, signum: int) -> None:
-        super().__init__(f"stopped by {signal.Signals(signum).name}")
+        super().__init__(signum)
         self.signum = signum
+
+    def __str__(self) -> str:
+        saved = f"stopped by {signal.Signals(self.signum).name}; all is saved"
+        if self.folder is None:
+            return saved
+        return f"{saved}. The same call with folder={str(self.folder)!r} goes on"
 
     @property
     def exit_code(self) -> int:
@@ -112,7 +168,8 @@ class StopSignals:
         self._pending = signum
         hint = "; once more: stop at once" if signum == signal.SIGINT else ""
         line = f"\n{signal.Signals(signum).name}: saving at the next safe point{hint}\n"
-        os.write(2, line.encode())  # print is not safe to enter twice
+        with suppress(OSError):  # a closed terminal must not keep the run from being saved
+            os.write(2, line.encode())  # print is not safe to enter twice
 
 
 def _shield_tracker() -> None:
@@ -121,6 +178,8 @@ def _shield_tracker() -> None:
     Slurm signals every process of a step. The tracker, which tqdm's lock brings, would die of most,
     and its successor complain in tracebacks of what it does not know.
     """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows, which has no such tracker
+        return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     try:
         resource_tracker.ensure_running()
@@ -225,6 +284,8 @@ def processor() -> str:
 
 def memory() -> int:
     """Returns the bytes that this process may use, by the machine and its container."""
+    if not hasattr(os, "sysconf"):  # Windows
+        return sys.maxsize
     whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     with suppress(OSError, ValueError):  # "max", or no such file
         return min(whole, int(Path("/sys/fs/cgroup/memory.max").read_text()))

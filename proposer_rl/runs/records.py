@@ -1,4 +1,4 @@
-"""Numbers, texts and pictures of a run's records. They may come from anybody and be anything."""
+"""The records of a run: their types, and their numbers, texts and pictures for a reader."""
 
 from __future__ import annotations
 
@@ -7,23 +7,20 @@ import io
 import json
 import math
 import re
-import warnings
 from collections.abc import Hashable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
-from pydantic import AfterValidator, BaseModel, Field, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import BaseModel, FiniteFloat, TypeAdapter, ValidationError
 
 from proposer_rl.runs.folder import is_rate, read_bounded
 
-PICTURE_BYTES = PICTURE_PIXELS = 2**20
 LARGEST = 1e100  # what is greater is no measurement, and overflows when it is drawn
-LONGEST_TEXT, LONGEST_NAME = 400, 80
-MOST_AXES = 64  # that an array may have
+LONGEST_TEXT, LONGEST_NAME = 400, 80  # of what is shown in a line
 
 # Total gains of replicas, by their name in the records of cycles; the first that is there is shown.
 GAINS = {"log_success_gain": "log success", "return_gain": "return"}
@@ -33,42 +30,16 @@ PLACE = {"cycle", "updates", "seed", "curriculum_frames", "evaluations", "histog
 Column = NDArray[np.float64]
 Record = Mapping[str, Any]
 T = TypeVar("T")
-Result = Annotated[float, Field(gt=-LARGEST, lt=LARGEST, allow_inf_nan=False)]
-Results = Annotated[list[Result], Field(min_length=1)]
 _adapter = cache(TypeAdapter)  # making one takes longer than checking a value
 COLOURS = 64  # of a picture: enough for drawings, and a third of the bytes
 WIDTH = 150  # pixels, of lines of text
 
 
-def _one_line(text: str) -> str:
-    if not text.isprintable():
-        raise ValueError("must be printable, on one line")
-    return text
-
-
-Name = Annotated[str, Field(min_length=1, max_length=LONGEST_NAME), AfterValidator(_one_line)]
-Text = Annotated[str, Field(max_length=LONGEST_TEXT), AfterValidator(_one_line)]
-
-
 class LevelRecord(BaseModel):
     """A level as its task recorded it: a PNG in base64, and lines of text."""
 
-    picture: Annotated[str, Field(max_length=PICTURE_BYTES * 4 // 3 + 4)] | None = None
-    text: Annotated[list[Text], Field(max_length=64)] = []
-
-
-# What a cycle tells in pictures, by their captions.
-Sheets = Annotated[dict[Name, list[LevelRecord]], Field(max_length=16)]
-
-
-class LevelResults(BaseModel):
-    """A seed's results on every level of a distribution."""
-
-    updates: int
-    seed: int
-    distribution: Name
-    success: Results | None = None
-    returns: Annotated[Results | None, Field(alias="return")] = None
+    picture: str | None = None
+    text: list[str] = []
 
 
 class SampleRecord(BaseModel):
@@ -95,18 +66,15 @@ class TaskFacts(BaseModel):
         exact: whether nothing is drawn at random to measure it; None where that is not said.
     """
 
-    title: Name
-    levels: Name = "levels"
-    distributions: Annotated[list[Name], Field(min_length=1)]
-    space: Annotated[
-        dict[Name, Annotated[list[FiniteFloat], Field(min_length=1, max_length=256)]],
-        Field(max_length=MOST_AXES),
-    ] = {}
-    about: dict[Name, Text] = {}
+    title: str
+    levels: str = "levels"
+    distributions: list[str]
+    space: dict[str, list[FiniteFloat]] = {}
+    about: dict[str, str] = {}
     measured: Any
-    samples: dict[Name, list[LevelRecord]] = {}
-    key: Text = ""
-    text_key: Text = ""
+    samples: dict[str, list[LevelRecord]] = {}
+    key: str = ""
+    text_key: str = ""
     exact: bool | None = None
 
 
@@ -129,7 +97,7 @@ def checked(kind: type[T], value: Any, where: str) -> T:
 def small_json(path: Path, largest: int = 2**20) -> Any:
     """Returns the content of a run's small JSON file; None if it cannot be read."""
     try:
-        return None if path.is_symlink() else json.loads(read_bounded(path, largest))
+        return json.loads(read_bounded(path, largest))
     except (OSError, ValueError, RecursionError):
         return None
 
@@ -159,20 +127,11 @@ def anywhere(text: str) -> str:
     return re.sub(r"(?<![\w./])/(?:[\w.\-]+/)+", "", text)
 
 
-def picture(encoded: Any) -> NDArray[np.uint8] | None:
-    """Returns a recorded picture, uint8 [H, W, 3]; None where it cannot be shown."""
+def picture(encoded: str | None) -> NDArray[np.uint8] | None:
+    """Returns a recorded picture, uint8 [H, W, 3]; None where there is none or it is damaged."""
     try:
-        content = base64.b64decode(encoded, validate=True)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
-                if not 0 < image.width * image.height <= PICTURE_PIXELS:
-                    return None
-                image.verify()
-            # Verified, a file must be opened again.
-            with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
-                return np.asarray(image.convert("RGB"))
-    except Exception:  # whatever a decoder makes of foreign bytes, it is no picture
+        return None if encoded is None else pixels(encoded)
+    except (ValueError, OSError, SyntaxError):  # of base64, PIL and its PNG decoder
         return None
 
 
@@ -201,7 +160,7 @@ def batch_shares(record: Record) -> dict[str, float]:
     """
     told = record.get("shares")
     means = {name: number(own) for name, own in told.items()} if isinstance(told, Mapping) else {}
-    return {printable(name)[:80]: mean for name, mean in means.items() if not math.isnan(mean)}
+    return {name: mean for name, mean in means.items() if not math.isnan(mean)}
 
 
 def words(name: str) -> str:
@@ -225,7 +184,7 @@ def png(picture: NDArray[np.uint8]) -> str:
 
 
 def pixels(text: str) -> NDArray[np.uint8]:
-    """Returns the picture uint8 [H, W, 3] in a text of :func:`png`; only for texts of our own."""
+    """Returns the picture uint8 [H, W, 3] in a text of :func:`png`."""
     with Image.open(io.BytesIO(base64.b64decode(text)), formats=["PNG"]) as image:
         return np.asarray(image.convert("RGB"))
 

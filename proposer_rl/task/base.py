@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,7 +31,6 @@ from proposer_rl.models import ActorCritic, Population, distribution_of, memory_
 from proposer_rl.runs.records import (
     LONGEST_NAME,
     LONGEST_TEXT,
-    pixels,
     png,
     shortened,
     written,
@@ -424,17 +422,12 @@ class Task(ABC):
         performance = self.performance(agent, levels, streams.generator()).cpu()
         copies, count = performance.batch_size
 
-        def picture(index: int) -> NDArray[np.uint8]:
-            return pixels(self.record(levels[index : index + 1], None)[0]["picture"])
-
         return [
             LevelResult(
                 level=f"{name}_{i:03}",
                 solver=k,
                 about={},
                 results={str(key): float(value) for key, value in performance[k, i].items()},
-                note="",
-                picture=partial(picture, i),
             )
             for i in range(count)
             for k in range(copies)

@@ -8,12 +8,10 @@ a task has one by having its members.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -89,16 +87,12 @@ class LevelResult(NamedTuple):
         solver: the Solver's number among those of a population.
         about: what the level is like, by name.
         results: the performance, ``success`` and ``return``, and whatever else there is, by name.
-        note: a few words for below a picture.
-        picture: draws what the Solver does there, uint8 [H, W, 3].
     """
 
     level: str
     solver: int
     about: Mapping[str, float]
     results: Mapping[str, float]
-    note: str
-    picture: Callable[[], NDArray[np.uint8]]
 
 
 @runtime_checkable
@@ -257,13 +251,8 @@ def space_features(space: Any, levels: Levels) -> Tensor:
         float64 [*B, 1 + 2 D + N] on the CPU.
 
     Raises:
-        ArgumentError: if the space cannot locate levels, or has no axes.
+        ArgumentError: if the space has no axes.
     """
-    if not hasattr(space, "locate"):
-        raise ArgumentError(
-            f"space={type(space).__name__}: must define locate(levels), the coordinates of levels, "
-            "from which a model of outcomes tells them apart"
-        )
     c = space.locate(levels).double().cpu()
     if not c.shape[-1]:
         raise ArgumentError(

@@ -34,8 +34,6 @@ def own(make: Callable[..., Any], **settings: Any) -> Recipe:
 
 
 def __getattr__(name: str) -> Callable[..., Recipe]:
-    if name == OF_GYMNASIUM:
-        raise AttributeError(f"{name} is a module to import; see from_gymnasium(env_id, ...)")
     return recipe_function("task", name)
 
 

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import scipy  # whose functions are loaded where they are asked for
 import torch
@@ -59,12 +59,10 @@ class LineSettings:
             ValueError: if it has neither values nor a range, both, or they do not rise.
         """
         low, high, bins = self.low, self.high, self.bins
-        if self.values is not None:
-            if (low, high, bins) != (None, None, None):
-                raise ValueError("either values, or low, high and bins")
+        if self.values is not None and (low, high, bins) == (None, None, None):
             return choice_bins(self.values)
-        if low is None or high is None:
-            raise ValueError("needs values, or low, high and perhaps bins")
+        if self.values is not None or low is None or high is None:
+            raise ValueError("needs either values, or low, high and perhaps bins")
         return intervals(low, high, bins or count)
 
 
@@ -154,11 +152,11 @@ def read_line(key: str, given: Any, count: int = 1) -> Bins:
             return intervals(float(given[0]), float(given[1]), count)
         if isinstance(given, list | range) and len(given):
             return choice_bins(list(given))
+        raise ValueError("must be (low, high), a range or a list")
     except ArgumentError as error:  # of an entry
         raise ArgumentError(f"{key}.{error}") from error
     except (ValueError, OverflowError) as error:
         raise ArgumentError(f"{key}={shown(given)}: {error}") from error
-    raise ArgumentError(f"{key}={shown(given)}: must be (low, high), a range or a list")
 
 
 def read_part(key: str, given: Any, line: Bins) -> Bins:
@@ -176,9 +174,6 @@ def read_part(key: str, given: Any, line: Bins) -> Bins:
     """
     given = python_values(given)
     if isinstance(given, Mapping):
-        name = given.get("distribution", "norm")
-        if name != "norm":
-            raise ArgumentError(f"{key}.distribution={shown(name)}: must be norm")
         law = normal_law if "distribution" in given else weighted_law
         try:
             return law(line, **arguments(law, given, ("line",)))
@@ -245,7 +240,9 @@ def weighted_law(line: Bins, values: Annotated[list[Any], Len(1)], weights: list
     return Law(single[:1], single[-1:], quantile, cumulative, name)
 
 
-def normal_law(line: Bins, distribution: str, loc: float = 0.0, scale: Positive = 1.0) -> Law:
+def normal_law(
+    line: Bins, distribution: Literal["norm"], loc: float = 0.0, scale: Positive = 1.0
+) -> Law:
     """Returns a normal distribution on a continuous range, cut off at its ends.
 
     Raises:

@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from proposer_rl.curricula.batches import moved
-from proposer_rl.models import callers_state
 
 OF_LEVELS = ("optimal_return", "exact_performance", "performance", "play")
 
@@ -35,8 +34,7 @@ def adapted(
         some = levels[0] if levels.ndim > 1 else levels
         some = some if device is None else moved(some, device)
         draws = [more[0][0]] if name == "play" else []
-        with callers_state():
-            found = function(given(some.clone()), *draws)  # which may change them
+        found = function(given(some.clone()), *draws)  # which may change them
         if isinstance(found, TensorDictBase):
             return found if found.ndim > 2 else found.unsqueeze(0)
         if isinstance(found, dict):

@@ -10,8 +10,6 @@ from multiprocessing.connection import Client, Connection, Listener
 from threading import Lock, Thread
 from typing import Any
 
-import torch
-
 
 class TeacherClient:
     """Stands for a teacher in another process; :meth:`Teacher.client` makes it, to be sent there.
@@ -85,17 +83,7 @@ class TeacherServer:
                 answer: tuple[Any, Exception | None]
                 try:
                     with self._teacher._here():  # what it computes in its caller's thread is over
-                        _check_precision()
                         answer = getattr(self._teacher, name)(*arguments, **more), None
                 except Exception as error:
                     answer = None, error
                 connection.send_bytes(pickle.dumps(answer))
-
-
-def _check_precision() -> None:
-    """Refuses to answer under another default dtype, which all threads of a process share."""
-    if (dtype := torch.get_default_dtype()) != torch.float32:
-        raise RuntimeError(
-            f"torch's default dtype is {dtype}: a teacher answers clients from a thread beside "
-            "your loop where it is torch.float32"
-        )

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
 from proposer_rl.curricula import outcome_of
-from proposer_rl.models import callers_state
 from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching.numbers import as_numbers
 
@@ -74,8 +73,7 @@ def outcome_of_rollout(rollout: TensorDictBase, rule: Any) -> TensorDict:
     """
     rollout, after = rollout.copy(), rollout["next"].copy()
     if "success" not in after.keys() and rule is not None:
-        with callers_state():
-            after["success"] = rule(after) if callable(rule) else after[rule]
+        after["success"] = rule(after) if callable(rule) else after[rule]
     rollout["next"] = after
     outcome = outcome_of(rollout)
     return outcome if "success" in after.keys() else outcome.exclude("success")

@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from torch import Tensor
 
-from proposer_rl.models import callers_state, own_state
+from proposer_rl.models import check_torch_defaults
 from proposer_rl.settings import ArgumentError, plain, shown, whole
 from proposer_rl.task import Distribution, Levels, space_features
 from proposer_rl.tasks.parameters import SEED, Bins, Law, ParameterSpace
@@ -80,8 +80,7 @@ class LevelSpace:
         if self._features is None:
             return space_features(self, levels)
         shape = levels.shape
-        with callers_state():
-            known = number_table(self._features(self.given(levels.reshape(-1))))
+        known = number_table(self._features(self.given(levels.reshape(-1))))
         return known.reshape(*shape, known.shape[1])
 
     def given(self, levels: Levels) -> Any:
@@ -127,7 +126,6 @@ class Parameters(LevelSpace, ParameterSpace):
         (8, True, 'stairs')
     """
 
-    @own_state()
     def __init__(
         self,
         ranges: Ranges,
@@ -137,6 +135,7 @@ class Parameters(LevelSpace, ParameterSpace):
         named: Mapping[str, Ranges] | None = None,
         seeded: bool = False,
     ) -> None:
+        check_torch_defaults()
         if seeded and SEED in ranges:
             raise ArgumentError("ranges.seed, seeded=True: a level has one seed; leave out either")
         counts = dict.fromkeys(ranges, 8)
@@ -230,7 +229,7 @@ class Parameters(LevelSpace, ParameterSpace):
                 warnings.warn(
                     f"{where}: most of it, {part}, lies outside of {low:g} to {high:g}, and comes "
                     "from the nearer end",
-                    stacklevel=5,
+                    stacklevel=4,
                 )
         return parts
 
@@ -265,7 +264,6 @@ class Items(LevelSpace):
         (tensor([0, 0, 1]), torch.Size([2, 5]))
     """
 
-    @own_state()
     def __init__(
         self,
         count: int,
@@ -275,6 +273,7 @@ class Items(LevelSpace):
         target: Sequence[int] | None = None,
         named: Mapping[str, Sequence[int]] | None = None,
     ) -> None:
+        check_torch_defaults()
         count = whole("count", count, 1)
         self.size = count
         self.axes = {"item": range(count)}
@@ -434,8 +433,7 @@ class LevelGenerator(LevelSpace):
     def _edits(self, edit: Callable[[Any, int, torch.Generator], Any]) -> Callable[..., Levels]:
         def edited(levels: Levels, count: int, generators: Sequence[torch.Generator]) -> Levels:
             rows = zip(levels, generators, strict=True)
-            with callers_state():
-                made = [(edit(self.given(own), count, g), len(own)) for own, g in rows]
+            made = [(edit(self.given(own), count, g), len(own)) for own, g in rows]
             return torch.stack([_taken("edit", new, n) for new, n in made])
 
         return edited
@@ -448,9 +446,7 @@ class _Drawn:
         self._name, self._draw = name, draw
 
     def sample(self, count: int, generator: torch.Generator) -> Levels:
-        with callers_state():
-            levels = self._draw(count, generator)
-        return _taken(self._name, levels, count)
+        return _taken(self._name, self._draw(count, generator), count)
 
 
 def _taken(name: str, levels: Any, count: int) -> Levels:

@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.models import callers_state
 from proposer_rl.tasks.parameters import ParameterSpace
 from proposer_rl.teaching.spaces import (
     DRAWN,
@@ -66,8 +65,7 @@ class MadeLevels(Parameters):
     def made(self, values: TensorDictBase, generator: torch.Generator) -> TensorDict:
         """Makes levels [n] of values of the parameters [n], and keeps these beside them."""
         kept = values.select(*self.bins)
-        with callers_state():
-            levels = self._make(kept.clone(), generator)
+        levels = self._make(kept.clone(), generator)
         return TensorDict({**kept, DRAWN: levels}, kept.batch_size)
 
     def inputs(self, levels: TensorDictBase) -> Tensor:

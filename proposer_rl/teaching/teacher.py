@@ -22,7 +22,7 @@ from torch.utils._pytree import tree_map_only
 from proposer_rl.curricula import Batch, Curriculum, Student, require
 from proposer_rl.curricula.batches import CPU, moved, packed
 from proposer_rl.curricula.ledger import OUT, OVER, RETURNED, Block, Ledger
-from proposer_rl.models import own_state
+from proposer_rl.models import check_torch_defaults
 from proposer_rl.recipes import Recipe
 from proposer_rl.runs.folder import storage
 from proposer_rl.settings import ArgumentError, Count, checked, whole
@@ -102,7 +102,7 @@ class Teacher:
     _rows: list[Any]  # its levels one by one, from the first time on
     _moved: Any  # its levels as the loop gets them, likewise
 
-    @own_state()
+    @torch.inference_mode(False)
     @checked
     def __init__(
         self,
@@ -117,6 +117,7 @@ class Teacher:
         student: Student | None = None,
         **can: Any,
     ) -> None:
+        check_torch_defaults()
         self.space, self.device, self.block = space, torch.empty(0, device=device).device, block
         self.id = token_hex(4)
         self._seed = whole("seed", seed)
@@ -134,7 +135,7 @@ class Teacher:
         self._ledger, self._tally = Ledger(dict.fromkeys(RESULTS, float)), Tally(space)
         self._scored: bool | None = None  # whether results come with a score; None before any
         self._succeeded: set[bool] = set()  # whether they came with a success, or without
-        self._proposals = 0
+        self._proposals = self._levels_told = 0  # the latter up to the last log()
         self._whole: list[int] = []  # first tickets of what propose() has given
         self._block, self._counted = None, 0
         self._use(None, 0)
@@ -273,7 +274,7 @@ class Teacher:
                 dropped = len(going)
             self._tally.dropped(dropped)
 
-    @own_state()
+    @torch.inference_mode(False)
     def observe(self, outcome: Any, ids: Any = None) -> None:
         """Takes the outcome of the levels that were proposed, or of those of some tickets.
 
@@ -312,7 +313,7 @@ class Teacher:
             if ids is None:
                 self._whole.clear()
 
-    @own_state()
+    @torch.inference_mode(False)
     def log(self, file: str | os.PathLike[str] | None = None) -> dict[str, Any]:
         """Returns what happened since the last call, and the curriculum's own log.
 
@@ -323,8 +324,9 @@ class Teacher:
         no curriculum.
 
         Args:
-            file: JSON Lines to which it is added as a line, without levels and with the teacher's
-                ``id`` as ``teacher``, for ``bin/report``, which draws each teacher by itself.
+            file: JSON Lines to which it is added as a line, without levels, with the teacher's
+                ``id`` as ``teacher``, and with ``levels_told`` since it began, for ``bin/report``,
+                which draws each teacher by itself, and what goes on from an earlier state.
 
         Raises:
             StorageError: if the file cannot be written.
@@ -332,14 +334,15 @@ class Teacher:
         with self._here():
             self._count()
             record = {**self.curriculum.log(), **self._tally.read(self._ledger.out)}
+            self._levels_told += record["told"]
             if file is not None:
-                kept = {"teacher": self.id, **record}
+                kept = {"teacher": self.id, "levels_told": self._levels_told, **record}
                 kept.pop("levels", None)
                 with storage(Path(file)), open(file, "a", encoding="utf-8") as lines:
                     lines.write(json.dumps(kept) + "\n")
             return record
 
-    @own_state()
+    @torch.inference_mode(False)
     def state_dict(self) -> dict[str, Any]:
         """Returns all that a resumed loop needs, with the tickets that are out."""
         with self._here():
@@ -347,6 +350,7 @@ class Teacher:
             return {
                 "of": self._of,
                 "id": self.id,
+                "levels_told": self._levels_told,
                 "curriculum": self.curriculum.state_dict(),
                 "ledger": self._ledger.state_dict(),
                 "scored": self._scored,
@@ -359,7 +363,7 @@ class Teacher:
                 else {"shape": list(kept.batch_size), "kept": packed(kept)},
             }
 
-    @own_state()
+    @torch.inference_mode(False)
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Puts back what :meth:`state_dict` returned, on whichever device its tensors are.
 
@@ -378,7 +382,7 @@ class Teacher:
                     "load it before collectors and environments begin, or drop() them, and reset "
                     "what plays them"
                 )
-            self.id = state["id"]
+            self.id, self._levels_told = state["id"], state["levels_told"]
             self.curriculum.load_state_dict(state["curriculum"])
             self._ledger.load_state_dict(state["ledger"], self._like)
             self._scored = state["scored"]
@@ -391,6 +395,19 @@ class Teacher:
             if kept := state["rollout"]:
                 steps = TensorDict.from_dict(dict(kept["kept"]), batch_size=kept["shape"])
                 self._kept = steps.flatten()
+
+    def diverge(self, number: int) -> None:
+        """Makes this teacher propose other levels, from the next one on, than its copies do.
+
+        Each of several processes that made or loaded the same teacher calls it with a number of
+        its own, such as its rank. With 0 nothing changes.
+        """
+        with self._here():
+            if number:
+                self._seed += number
+                if self._block is not None:
+                    self._block.state[:, self._at - self._block.start :] = OVER
+                self._use(None, 0)
 
     @cached_property
     def _like(self) -> Levels:
@@ -456,9 +473,10 @@ class Teacher:
             self._tally.count(block.batch.levels[:, some])
             self._counted = self._at
 
-    @own_state()
+    @torch.inference_mode(False)
     def _next(self, count: int) -> Block:
         """Lets the curriculum observe the results there are, and returns what it then proposes."""
+        check_torch_defaults()
         for batch, results in self._ledger.take():
             self.curriculum.observe(self.student, batch, as_outcome(results))
         streams = Streams(self._seed, "update", self._proposals)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import update_wrapper
-from inspect import iscoroutinefunction
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -36,13 +35,12 @@ class TaughtReward(TrainerCallback):
 
     Args:
         teacher: of :class:`Items`, one for each row of the training set.
-        reward: of completions and columns, as TRL calls it: of each how well it solves its prompt,
-            from 0 to 1; None for one that does not count.
+        reward: a function, no coroutine, of completions and columns, as TRL calls it: of each how
+            well it solves its prompt, from 0 to 1; None for one that does not count.
         source: the column of the training set by which metrics are logged, too; None for none.
 
     Raises:
-        ArgumentError: if the teacher's levels are no items of one student, or the reward is no
-            function, or a coroutine.
+        ArgumentError: if the teacher's levels are no items of one student.
     """
 
     _trainer: Any = None
@@ -56,10 +54,7 @@ class TaughtReward(TrainerCallback):
         reward: Callable[..., Sequence[float | None]],
         source: str | None = None,
     ) -> None:
-        rows = items_of(teacher).size
-        if not callable(reward) or iscoroutinefunction(reward):
-            raise ArgumentError("reward: must be a function, no coroutine: ranks are told in step")
-        self._teacher, self._rows, self._reward = teacher, rows, reward
+        self._teacher, self._rows, self._reward = teacher, items_of(teacher).size, reward
         self._source = source
         self._told = 0  # generations
         self._again = False  # whether the next one repeats the last that was reported
@@ -74,23 +69,19 @@ class TaughtReward(TrainerCallback):
         Raises:
             ArgumentError: naming what of the trainer does not fit.
         """
-        if self._trainer is not None:
-            raise ArgumentError("trainer: is another one; each needs a TaughtReward of its own")
         if self not in trainer.reward_funcs:
             raise ArgumentError("reward_funcs: must have this TaughtReward, which reports results")
         rows, config = trainer.train_dataset, trainer.args
-        count = len(rows) if hasattr(rows, "__len__") else "a stream of"
-        if count != self._rows:
-            raise ArgumentError(f"train_dataset: has {count} rows, the teacher {self._rows} items")
-        columns = rows.column_names
-        if ROW in columns:
-            raise ArgumentError(f"train_dataset: has a column {ROW}, as of another TaughtReward")
-        if self._source is not None and self._source not in columns:
-            known = ", ".join(columns)
-            raise ArgumentError(f"source={self._source}: is no column of train_dataset: {known}")
+        count = f"{len(rows)} rows" if hasattr(rows, "__len__") else "a stream"
+        if count != f"{self._rows} rows":
+            raise ArgumentError(
+                f"train_dataset: {count}, but must be a Dataset with one row for each of the "
+                f"teacher's {self._rows} items"
+            )
         for name in ("ignore_data_skip", "remove_unused_columns"):
             if getattr(config, name):
                 raise ArgumentError(f"{name}=True: must be false")
+        numbered = rows.add_column(ROW, [*range(self._rows)])
         self._group = config.generation_batch_size // config.num_generations
         self._rounds = config.steps_per_generation * config.num_iterations
         self._groups = -(-self._rows // self._group)  # of an epoch
@@ -103,7 +94,7 @@ class TaughtReward(TrainerCallback):
             sources=None if self._source is None else [*rows[self._source]],
         )
         self._trainer, self._loader = trainer, trainer.get_train_dataloader
-        trainer.train_dataset = rows.add_column(ROW, [*range(self._rows)])
+        trainer.train_dataset = numbered
         trainer.get_train_dataloader = self._taught_dataloader
         trainer.add_callback(self)
 
@@ -117,7 +108,7 @@ class TaughtReward(TrainerCallback):
         """Returns the rewards; while the model trains, the teacher gets them as results."""
         if self._trainer is None:
             raise ArgumentError("trainer: missing: call attach(trainer) before it trains")
-        items = columns.pop(ROW, None)
+        items = columns.pop(ROW, None)  # none in evaluation
         rewards = self._reward(completions=completions, **columns)
         if self._trainer.model.training:
             if not self._again:
@@ -130,15 +121,8 @@ class TaughtReward(TrainerCallback):
         return rewards
 
     def load(self, folder: str | Path) -> None:
-        """Loads the curriculum of a checkpoint that does not lie in the config's output_dir.
-
-        Raises:
-            ArgumentError: if it has none.
-        """
-        file = Path(folder) / FILE
-        if not file.exists():
-            raise ArgumentError(f"resume_from_checkpoint={folder}: has no {FILE}")
-        state = torch.load(file, weights_only=True)
+        """Loads the curriculum of a checkpoint that does not lie in the config's output_dir."""
+        state = torch.load(Path(folder) / FILE, weights_only=True)
         self._teacher.load_state_dict(state["teacher"])
         self._sampler.load_state_dict(state["sampler"])
         self._sampler.rewind()  # the trainer skips what it has had

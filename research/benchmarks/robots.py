@@ -62,6 +62,7 @@ class Fleet:
         levels = TensorDict(self.level, [count])
         self._robots = RobotEnv(levels, max_steps=LIMIT, device=device)
         self.episode_length_buf = torch.zeros(count, dtype=torch.int64, device=device)
+        self.common_step_counter = 0
         self.returns = torch.zeros(count, device=device)
         self.success = torch.zeros(count, dtype=torch.bool, device=device)
         self.state = torch.zeros(count, RobotEnv.state_size, device=device)
@@ -79,6 +80,7 @@ class Fleet:
         made = self._robots.advance(self.state, actions.clamp(-1, 1), self.level, self._chance())
         self.state = made.state
         self.episode_length_buf += 1
+        self.common_step_counter += 1
         self.returns += made.reward
         late = self.episode_length_buf >= LIMIT
         self.reset_buf = made.terminated | late

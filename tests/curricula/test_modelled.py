@@ -165,11 +165,6 @@ def test_features_that_are_not_finite_are_refused() -> None:
         curriculum.propose(Student(), 3, [Streams(0)])
 
 
-def test_a_space_that_cannot_locate_levels_is_named() -> None:
-    with pytest.raises(ValueError, match="space=SimpleNamespace: must define locate"):
-        space_features(SimpleNamespace(coordinates=torch.zeros(1, 1)), torch.zeros(1, 1))
-
-
 SPACES = {
     "parameters": lambda: Parameters({"force": (0.5, 4.5)}, bins=4, target={"force": 4.5}),
     "many items": lambda: Items(400, features=torch.linspace(0, 1, 400)[:, None], target=[399]),

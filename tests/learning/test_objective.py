@@ -30,8 +30,3 @@ def test_the_return_to_come_minus_the_mean_of_the_others(gamma: float) -> None:
 def test_what_all_copies_share_is_no_ones_merit() -> None:
     advantage = LeaveOneOutBaseline(1.0)(episodes(torch.arange(5.0).expand(3, 5)))["advantage"]
     torch.testing.assert_close(advantage, torch.zeros(3, 5, 1))
-
-
-def test_one_copy_has_no_others() -> None:
-    with pytest.raises(ValueError, match="at least 2 copies, got 1"):
-        LeaveOneOutBaseline(1.0)(episodes(torch.zeros(1, 2)))

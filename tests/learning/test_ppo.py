@@ -366,7 +366,7 @@ def test_a_copy_trains_alike_in_whatever_place_it_stands(chosen: list[int], seed
 
 def test_restore_refuses_what_does_not_fit() -> None:
     ppo = learner(copies=2)
-    with pytest.raises(ValueError, match=r"batch size \[2\], got \[3\]"):
+    with pytest.raises(ValueError, match="another network"):
         ppo.restore(ppo.snapshot()[[0, 0, 0]])
     other = ppo.snapshot()
     name = next(iter(other.keys()))
@@ -377,14 +377,8 @@ def test_restore_refuses_what_does_not_fit() -> None:
         ppo.restore(other)
     narrow = ppo.snapshot()
     narrow[name]["value"] = narrow[name]["value"][:, :1]
-    with pytest.raises(ValueError, match=f"{name} does not fit: another shape"):
+    with pytest.raises(ValueError, match="another network"):
         ppo.restore(narrow)
-
-
-def test_refuses_an_environment_of_another_size() -> None:
-    agent = learner(copies=2).agent
-    with pytest.raises(ValueError, match=r"agent has 2 copies.*batch size is \[3, 6\]"):
-        PPO(MazeEnv(levels(3)), agent, SETTINGS)
 
 
 def test_entries_may_have_other_names() -> None:

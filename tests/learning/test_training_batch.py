@@ -151,11 +151,6 @@ def test_the_clip_falls_with_the_learning_rate() -> None:
     assert any(not torch.equal(e["value"], weights[2][n, "value"]) for n, e in weights[0].items())
 
 
-def test_a_clip_that_nothing_anneals_is_refused() -> None:
-    with pytest.raises(ArgumentError, match=r"^anneal_clip=True: needs anneal_updates"):
-        of_maze(replace(SETTINGS, anneal_clip=True), False)
-
-
 def test_a_clipped_value_loss_is_the_larger_error() -> None:
     """Of the value, and of the value moved from the old one by at most a little."""
     bound = 1e-3

@@ -21,8 +21,6 @@ from proposer_rl.report.statistics import (
     Interval,
     difference_of,
     holm,
-    interquartile_mean,
-    jackknife,
     mean_of,
     median_of,
     probability_of_improvement,
@@ -109,28 +107,6 @@ def test_intervals_of_an_improvement_cover(probability: float, spread: float, se
     found = [probability_of_improvement(a, b) for a, b in zip(one, other, strict=True)]
     assert covered(found, probability) >= ENOUGH
     assert all(interval.high - interval.low > 0.1 for interval in found)
-
-
-@pytest.mark.parametrize("seeds", [5, 10])
-def test_intervals_over_levels_and_seeds_cover(seeds: int) -> None:
-    """The scores of a seed hang together: to draw every level's seeds anew covers one in four."""
-    rng = np.random.default_rng(0)
-    hardness = rng.normal(0, 2, 64)
-
-    def scores(count: int) -> np.ndarray:
-        ability = rng.normal(0.5, 0.7, (count, seeds, 1))
-        return 1 / (1 + np.exp(-(ability + hardness + rng.normal(0, 1, (count, seeds, 64)))))
-
-    truth = interquartile_mean(scores(2000))
-    found = [jackknife(interquartile_mean, rows) for rows in scores(1200)]
-    held = np.mean([one.low <= truth <= one.high for one in found])
-    assert held >= ENOUGH
-    drawn = []
-    for rows in scores(50):
-        places = rng.integers(0, seeds, (80, seeds, 64))
-        means = [interquartile_mean(np.take_along_axis(rows, place, 0)) for place in places]
-        drawn.append(np.quantile(means, [0.025, 0.975]))
-    assert np.mean([low <= truth <= high for low, high in drawn]) < 0.5
 
 
 def study_of(curves: dict[str, np.ndarray], proposer: str = "") -> Study:

@@ -85,106 +85,34 @@ def test_a_wrong_folder_is_named(name: str, tmp_path: Path) -> None:
         find_runs([tmp_path / name])
 
 
-def broken(folder: Path, name: str, change) -> None:
-    path = folder / name
-    path.write_text(change(path.read_text()))
-
-
-def set_key(*keys: str, value: object):
-    def change(text: str) -> str:
-        content = json.loads(text)
-        inner = content
-        for key in keys[:-1]:
-            inner = inner[key]
-        inner[keys[-1]] = value
-        return json.dumps(content)
-
-    return change
-
-
-def in_levels(key: str, value: object):
-    def change(text: str) -> str:
-        row = json.loads(text.splitlines()[0])
-        row["levels"][0][key] = value
-        return json.dumps(row) + "\n"
-
-    return change
-
-
-def in_row(key: str, value: object):
-    return lambda text: json.dumps({**json.loads(text.splitlines()[0]), key: value}) + "\n"
-
-
-def in_cycle(value: object):
-    return in_row("levels", value)
+def replaced(old: str, new: str):
+    return lambda text: text.replace(old, new)
 
 
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("config.json", lambda text: "[]", "not a JSON object"),
-        ("config.json", lambda text: "[" * 100_000, "recursion"),
-        ("config.json", lambda text: text[:-5], "config.json is no JSON: Unterminated"),
-        ("run.json", lambda text: "{", "run.json is no JSON: Expecting"),
-        ("config.json", set_key("schedule", value={}), "'headline' is missing"),
-        ("config.json", lambda text: text.replace('"method"', '"m"'), "'method' is missing"),
-        ("config.json", set_key("method", value="x" * 1000), "method: String should have at most"),
-        ("config.json", set_key("method", value="a\nb"), "method: Value error, must be printable"),
-        ("config.json", set_key("schedule", "threshold", value="high"), "threshold is no number"),
-        ("config.json", set_key("schedule", "threshold", value=[0.8]), "threshold is no number"),
-        ("metrics.csv", lambda text: text.replace("0.5", "nan"), "id_success is not always a"),
-        ("metrics.csv", lambda text: text.replace("0.5", "half"), "is not a number"),
-        ("metrics.csv", lambda text: text.replace("id_success", "x"), "no column 'id_success'"),
+        ("config.json", lambda text: text[:-5], "config.json: Unterminated string"),
+        ("config.json", replaced('"schedule"', '"s"'), "'schedule' is missing"),
+        ("run.json", lambda text: "[]", "run.json: Input should be a valid dictionary"),
+        ("run.json", lambda text: "{}", "'task' is missing"),
+        ("run.json", replaced('"title"', '"t"'), "run.json: task: title: Field required"),
+        ("metrics.csv", replaced("0.5", "nan"), "id_success is not always a number"),
+        ("metrics.csv", replaced("0.5", "1e300"), "id_success is not always a number"),
+        ("metrics.csv", replaced("id_success", "x"), "id_success is not always a number"),
+        ("metrics.csv", replaced("0.5", "half"), "metrics.csv, line 3: 'half' is not a number"),
         ("metrics.csv", lambda text: text.splitlines()[0] + "\n", "no rows yet"),
         ("metrics.csv", lambda text: text + text.splitlines()[1] + "\n", "do not grow"),
-        ("metrics.csv", lambda text: text.replace("0.5", "1e300"), "id_success is not always a"),
-        ("training.csv", lambda text: text.replace("updates", "x"), "no column 'updates'"),
-        (
-            "training.csv",
-            lambda text: text.replace("fuel", "\x1b[2J"),
-            "name of a column: Value error",
-        ),
-        ("curriculum.jsonl", in_levels("picture", 1), "0.levels.0.picture: Input should be a"),
-        ("curriculum.jsonl", in_levels("picture", "A" * 2**21), "String should have at most"),
-        ("curriculum.jsonl", in_levels("text", "S G"), "text: Input should be a valid list"),
-        ("curriculum.jsonl", in_levels("text", ["x"] * 65), "at most 64 items"),
-        ("curriculum.jsonl", in_levels("text", ["x" * 401]), "at most 400 characters"),
-        ("curriculum.jsonl", in_levels("text", ["\x1b[2J"]), "must be printable"),
-        ("cycles.jsonl", lambda text: text.replace('"updates": 0', '"updates": "x"'), "no number"),
-        ("cycles.jsonl", lambda text: text.replace('"updates"', '"x"'), "'updates' is missing"),
-        ("cycles.jsonl", in_cycle(["x"]), "levels: Input should be a valid dict"),
-        ("cycles.jsonl", in_cycle({"best": [1]}), "levels: best.0: Input should be"),
-        ("cycles.jsonl", in_cycle({"best": [{"picture": 1}]}), "best.0.picture: Input should be"),
-        ("cycles.jsonl", in_cycle({"a\nb": []}), "must be printable"),
-        ("cycles.jsonl", in_cycle({str(i): [] for i in range(17)}), "at most 16 items"),
-        ("levels.jsonl", in_row("success", []), "0.success: List should have at least 1 item"),
-        ("levels.jsonl", in_row("success", ["x"]), "0.success.0: Input should be a valid number"),
-        ("levels.jsonl", in_row("success", [float("nan")]), "0.success.0: Input should be"),
-        ("levels.jsonl", in_row("return", [1e200]), "0.return.0: Input should be less"),
-        ("levels.jsonl", in_row("distribution", "\x07"), "0.distribution: Value error"),
-        ("levels.jsonl", in_row("seed", "0"), "0.seed: Input should be a valid integer"),
-        ("run.json", lambda text: "{}", "'task' is missing"),
-        ("run.json", set_key("task", value=[]), "task: Input should be"),
-        ("run.json", set_key("task", "title", value="\x07"), "task: title: Value error"),
-        ("run.json", set_key("task", "distributions", value=[]), "at least 1 item"),
-        ("run.json", set_key("task", "distributions", value=[[]]), "distributions.0: Input"),
-        ("run.json", set_key("task", "space", value={"a": ["x"]}), "space.a.0: Input"),
-        ("run.json", set_key("task", "space", value={"a": [0] * 257}), "at most 256 items"),
-        (
-            "run.json",
-            set_key("task", "space", value={str(key): [0] for key in range(65)}),
-            "at most 64 items",
-        ),
-        ("run.json", set_key("task", "about", value={"a": "b\nc"}), "about.a: Value error"),
-        ("run.json", set_key("task", "samples", value={"id": [1]}), "samples.id.0: Input"),
+        ("curriculum.jsonl", replaced('"seed": 0', '"seed": "0"'), "0.seed: Input should be a"),
+        ("cycles.jsonl", replaced('"cycle": 0', '"levels": ["x"]'), "cycles.jsonl: levels: Input"),
     ],
 )
-def test_a_folder_that_is_not_what_it_should_be_is_refused_in_one_line(
+def test_a_folder_that_cannot_be_read_is_named_in_one_line(
     name: str, change, message: str, tmp_path: Path
 ) -> None:
     cycles = [cycle(0, [0.1, 0.1], [[1], [1]])]
     folder = write_run(tmp_path / "run", cycles=cycles, levels=[0.5])
-    broken(folder, name, change)
+    (folder / name).write_text(change((folder / name).read_text()))
     with pytest.raises(UnreadableRun) as refused:
         read_run(folder)
     assert message in str(refused.value) and "\n" not in str(refused.value)
@@ -194,25 +122,33 @@ def test_a_folder_that_is_not_what_it_should_be_is_refused_in_one_line(
 @pytest.mark.parametrize(
     ("table", "text", "message"),
     [
-        ("runs", "run,config,facts\n../a,{},{}\n", "leads out of the study"),
         ("runs", "run,config\na,{}\n", "an entry 'facts' is missing"),
-        ("runs", "run,config,facts\na,{},[]\n", "facts: Input should be a valid dictionary"),
         ("metrics", "run,seed,updates\n", "metrics.csv has no rows yet"),
         ("metrics", "run,seed,updates\ntarget_0,0,many\n", "could not convert"),
         ("cycles", "run,updates\ntarget_0,nothing\n", "Expecting value"),
-        ("levels", None, "levels.csv.xz is cut off"),
+        ("levels", None, "levels.csv.xz: "),
     ],
 )
-def test_a_broken_study_is_named_in_one_line(
+def test_a_study_that_cannot_be_read_is_named_in_one_line(
     table: str, text: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("research.publish.write_page", lambda _: None)  # its figures
     publish([write_run(tmp_path / "target_0", levels=[0.5])], light := tmp_path / "light")
-    packed = b"" if text is None else lzma.compress(text.encode())
+    packed = b"no xz" if text is None else lzma.compress(text.encode())
     (light / f"{table}.csv.xz").write_bytes(packed)
     with pytest.raises(UnreadableRun, match=message) as refused:
         read_run(light)
     assert len(str(refused.value).splitlines()) == 1 and TASK["title"] not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["config.json", "run.json", "summary.json"])
+def test_the_mark_and_line_ends_of_windows_are_read(name: str, tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    (before,) = read_run(folder)
+    text = (folder / name).read_bytes().replace(b"\n", b"\r\n")
+    (folder / name).write_bytes(b"\xef\xbb\xbf" + text)
+    (after,) = read_run(folder)
+    assert (after.config, after.facts, after.finished) == (before.config, before.facts, True)
 
 
 def test_what_is_told_of_single_levels_is_each_seeds_own(tmp_path: Path) -> None:
@@ -245,30 +181,6 @@ def test_a_curriculum_tells_of_levels_in_the_last_cycle_that_has_any(tmp_path: P
     ]
     assert run.sheets["best"][0].picture == LEVEL["picture"]
     assert not any("levels" in row for row in run.cycles)
-
-
-@pytest.mark.parametrize("name", ["config.json", "metrics.csv", "cycles.jsonl"])
-def test_a_file_of_other_bytes_than_text_is_named(name: str, tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run", cycles=[cycle(0, [0.1, 0.1], [[1], [1]])])
-    (folder / name).write_bytes((folder / name).read_bytes()[:9] + b"\xff\n")
-    with pytest.raises(UnreadableRun, match=f"{name}.*: 'utf-8' codec"):
-        read_run(folder)
-
-
-def test_files_outside_of_the_folder_are_not_read(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run")
-    secret = tmp_path / "secret.csv"
-    os.replace(folder / "metrics.csv", secret)
-    os.symlink(secret, folder / "metrics.csv")
-    with pytest.raises(UnreadableRun, match="not a plain file"):
-        read_run(folder)
-
-
-def test_a_huge_file_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = write_run(tmp_path / "run")
-    monkeypatch.setattr(reading, "LARGEST_FILE", 100)
-    with pytest.raises(UnreadableRun, match="is larger than"):
-        read_run(folder)
 
 
 def test_a_run_with_too_many_pictures_is_read_without_them(

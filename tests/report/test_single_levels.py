@@ -64,13 +64,8 @@ def test_the_worst_share_is_a_median_with_its_interval(tmp_path: Path) -> None:
     assert (median, low, high) == pytest.approx(known)
 
 
-def test_the_methods_are_summed_up_over_levels(tmp_path: Path) -> None:
+def test_a_method_is_more_or_less_probably_better_than_the_baseline(tmp_path: Path) -> None:
     rows = {row["method"]: row for row in group_table(study_of(tmp_path)).rows}
-    gap = rows["target"]["optimality gap of ID success"]
-    assert gap.estimate == pytest.approx(1 - 0.42) and gap.high > gap.low
-    pooled = sorted(value + 0.01 * seed for value in LEVELS["target"] for seed in range(5))
-    assert rows["target"]["IQM of ID success"].estimate == pytest.approx(np.mean(pooled[3:-3]))
-    assert rows["hand_designed"]["IQM of ID success"] is None
     assert rows["target"]["P(better than domain_randomization)"].estimate == 0.5
     assert rows["domain_randomization"]["P(better than domain_randomization)"] is None
 
@@ -117,7 +112,6 @@ def test_without_single_levels_there_is_no_figure(tmp_path: Path) -> None:
     write_run(tmp_path / "a", "target")
     study = read_studies([tmp_path / "a"], None)[0][0]
     assert not worst(study)
-    assert not any("IQM" in name for name in group_table(study).columns)
 
 
 def test_a_legend_has_the_methods_that_are_drawn(tmp_path: Path) -> None:

@@ -18,8 +18,6 @@ from proposer_rl.report.statistics import (
     balanced,
     difference_of,
     holm,
-    interquartile_mean,
-    jackknife,
     mean_of,
     median_interval,
     median_of,
@@ -84,7 +82,6 @@ def test_too_few_runs_and_runs_without_spread_have_no_interval() -> None:
     assert math.isnan(difference_of([1.0, 3.0], many).p)
     assert math.isnan(difference_of([1.0] * 5, [2.0] * 5).p)
     assert math.isnan(probability_of_improvement([1.0] * 4, many).low)
-    assert math.isnan(jackknife(np.mean, np.ones((4, 2))).low)
     assert seeds_needed(mean_of([1.0, 2.0]), 2, 0.05) is None
 
 
@@ -106,20 +103,6 @@ def test_the_interval_of_an_improvement_is_that_of_a_share() -> None:
     found = probability_of_improvement([3, 3, 3, 3, 0] * 2, [1] * 30)
     known = stats.binomtest(8, 10).proportion_ci(method="exact")
     assert found[1:] == pytest.approx((known.low, known.high))
-
-
-def test_the_interquartile_mean_leaves_a_quarter_out_at_each_end() -> None:
-    scores = np.array([[0, 1, 2, 3], [4, 5, 6, 1000]])
-    assert interquartile_mean(scores) == pytest.approx((2 + 3 + 4 + 5) / 4)
-
-
-@given(values)
-def test_the_jackknife_of_a_mean_is_students(found: list[float]) -> None:
-    rows = np.array(found)[:, None] + np.array([-1.0, 0.0, 1.0])
-    one, known = jackknife(np.mean, rows), mean_of(found).interval()
-    assert one.estimate == pytest.approx(known.estimate)
-    if len({round(value, 3) for value in found}) == len(found):  # what is rounded ties no more
-        assert one[1:] == pytest.approx(known[1:], abs=1e-6)
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=6))

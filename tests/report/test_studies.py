@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -121,15 +120,11 @@ def test_seeds_that_were_trained_side_by_side_are_again(tmp_path: Path) -> None:
         words = [f"seeds={seeds}" if len(seeds) > 1 else f"seed={seeds[0]}"]
         overrides = ["task=cartpole", "+method=plr", *words, "+sweep=own"]
         write_run(tmp_path / name, "plr", seeds, facts={"overrides": overrides})
-    hostile = write_run(tmp_path / "d", "plr", [8, 9], facts={"overrides": overrides})
-    settings = hostile / "config.json"
-    settings.write_text(json.dumps({**json.loads(settings.read_text()), "seeds": "`x`"}))
     (study,), _ = read(tmp_path)
     assert commands(study) == [
         "bin/train task=cartpole +method=plr 'seeds=[0,1]'",
         "bin/train task=cartpole +method=plr 'seeds=[5,3,4]'",
         "bin/train -m task=cartpole +method=plr seed=7",
-        "# plr: the command was not recorded",
     ]
 
 
@@ -137,11 +132,6 @@ def test_seeds_that_were_trained_side_by_side_are_again(tmp_path: Path) -> None:
     "facts",
     [
         {"overrides": None},
-        {"overrides": [1]},
-        {"overrides": ["a=1\n```"]},
-        {"overrides": ["a=" + "1" * 9999]},
-        {"arguments": []},
-        {"arguments": {"config_dir": 1}},
         # As prl.train records a task, or a curriculum, of one's own.
         {"overrides": ["~task", "+method=plr", "seed=0"]},
         {"overrides": ["task=maze", "+scale=smoke", "seed=0"]},

@@ -1,8 +1,7 @@
-"""Peers beside ours: what jaxued's maze is given, who is refused, and that its process ends."""
+"""Peers beside ours: what jaxued is given and who is refused; the rest with the real package."""
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -15,17 +14,14 @@ import torch
 
 from proposer_rl.tasks.view_mazes.view_levels import ViewLevel
 from research.benchmarks.__main__ import main
-from research.benchmarks.jaxued_peer import LEAN, TRAINING, WAYS, WRAPPER
+from research.benchmarks.jaxued_peer import TRAINING, WAYS
 from research.benchmarks.peer import jaxued_maze, played
-from research.benchmarks.results import Options
-from research.benchmarks.teacher import beside_syllabus
 from research.benchmarks.timing import threads
 from research.benchmarks.view import MAX_STEPS, beside_jaxued, through_minigrid
-from research.benchmarks.view_training import SMALL, on_these_cores
+from research.benchmarks.view_training import SMALL
 from tests.commands import call
 from tests.tasks.view_mazes.oracles import random_levels
 
-TRIED = Options(repeats=1, precision="fp32", size="tiny")
 DRAWINGS = ["v#..\n.#G.", "..<#\nG...", "G#.^\n....", "...G\n.>#."]
 JAXUED = os.environ.get("JAXUED_PYTHON")
 real = pytest.mark.skipif(not JAXUED, reason="JAXUED_PYTHON names no interpreter that has jaxued")
@@ -41,57 +37,19 @@ for i, drawing in enumerate(sys.argv[2:]):
         np.testing.assert_array_equal(given[name][i], getattr(level, name), strict=True)
 """
 
-# Answers as benchmarks/jaxued_peer.py does, but plays nothing.
-FAKE = """#!{interpreter}
-import json, os, sys
-print(json.dumps({{"jaxued": "0", "jax": "0", "cores": 1, "pid": os.getpid()}}), flush=True)
-open({note!r}, "w").write(str(os.getpid()))
-for line in sys.stdin:
-    if {dies}:
-        sys.exit(3)
-    seconds = {{"wrapper": 0.5, "lean": 0.25, "training": 0.125}}[line.strip()]
-    print(json.dumps({{"seconds": seconds, "reward": {reward}}}), flush=True)
-"""
-
-
-@pytest.fixture
-def fake(tmp_path: Path):
-    """Makes an interpreter that is none; returns its path, and the file with its process's id."""
-
-    def make(reward: float = 0.0, dies: bool = False) -> tuple[str, Path]:
-        program, note = tmp_path / "fake", tmp_path / "pid"
-        text = FAKE.format(interpreter=sys.executable, note=str(note), reward=reward, dies=dies)
-        program.write_text(text)
-        program.chmod(0o755)
-        return str(program), note
-
-    return make
-
-
-def has_ended(note: Path) -> bool:
-    try:
-        os.kill(int(note.read_text()), 0)
-    except ProcessLookupError:
-        return True
-    return False
-
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["view", "--jaxued", "nowhere/python"], "--jaxued nowhere/python: No such file"),
         (["view", "--jaxued", sys.executable], "No module named 'jaxued'; must be an interpreter"),
-        (["view", "--jaxued", "/bin/echo"], "--jaxued /bin/echo: it does not run Python; must be"),
         (
             ["meta", "levels", "--jaxued", "p"],
             "is for the benchmark view and view_training, not for meta, levels",
         ),
-        (["--jaxued", "p", "--device", "meta"], "measured on the CPU; give --device cpu, not meta"),
         (
             ["teacher", "--syllabus", sys.executable],
             "No module named 'syllabus'; must be an interp",
         ),
-        (["view", "--syllabus", "p"], "is for the benchmark teacher, not for view"),
     ],
 )
 def test_refused_before_anything_is_measured(
@@ -122,61 +80,6 @@ def test_levels_are_given_as_jaxued_has_them() -> None:
     assert given["actions"].shape == (5, 4) and given["max_steps"] == 250
 
 
-def test_rows_hold_the_times_of_the_process_s_own_clock(fake) -> None:
-    levels = ViewLevel.from_text(DRAWINGS)
-    actions = torch.randint(3, (40, 4), generator=torch.Generator().manual_seed(0))
-    program, note = fake(through_minigrid(levels, actions))
-    result = beside_jaxued([(levels, actions)], program, repeats=3)
-    ours, *theirs = result.rows
-    assert ours.samples[WRAPPER] == [0.5] * 3 and ours.samples[LEAN] == [0.25] * 3
-    assert [row.value.median for row in theirs[::2]] == [320.0, 640.0]
-    for row, seconds in zip(theirs[1::2], (0.5, 0.25), strict=True):
-        mine = sorted(ours.samples["TorchRL"])
-        expected = [seconds / time for time in reversed(mine)]
-        assert [row.value.low, row.value.median, row.value.high] == pytest.approx(expected)
-    assert has_ended(note)
-
-
-def test_training_beside_a_peer_is_frames_by_either_one_s_clock(fake) -> None:
-    program, note = fake()
-    with threads(1):
-        result = on_these_cores(SMALL, replace(TRIED, jaxued=program))
-    ours, theirs, relative = result.rows
-    settings = SMALL.config.solver
-    frames = settings.batch_size * settings.ppo.horizon
-    assert theirs.value.median == frames / 0.125
-    assert relative.value.median == pytest.approx(0.125 / ours.samples["update"][0])
-    assert "0, jax 0, on 1 core(s)" in result.notes[0] and has_ended(note)
-
-
-def test_what_syllabus_says_of_its_calls_becomes_rows(tmp_path: Path) -> None:
-    program = tmp_path / "fake"
-    said = {"syllabus": "0", "seconds": {"one": [0.004, 0.001, 0.002], "other": [1.0]}}
-    program.write_text(f"#!{sys.executable}\nprint({json.dumps(json.dumps(said))})\n")
-    program.chmod(0o755)
-    one, other = beside_syllabus(str(program), 16, 3)
-    assert (one.value.low, one.value.median, one.value.high) == (0.001, 0.002, 0.004)
-    assert "Syllabus 0, 4000 tasks, other" in other.what and other.reached is None
-
-
-def test_other_rewards_end_the_comparison_and_the_process(fake) -> None:
-    program, note = fake(reward=1e9)
-    levels = ViewLevel.from_text(DRAWINGS)
-    with pytest.raises(AssertionError, match="the environments differ"):
-        beside_jaxued([(levels, torch.zeros(5, 4, dtype=torch.int64))], program, repeats=1)
-    assert has_ended(note)
-
-
-def test_a_process_that_ends_is_told(fake) -> None:
-    program, _ = fake(dies=True)
-    levels = ViewLevel.from_text(DRAWINGS)
-    with (
-        pytest.raises(RuntimeError, match="ended with exit code 3"),
-        jaxued_maze(program, levels, torch.zeros(5, 4, dtype=torch.int64), 250) as peer,
-    ):
-        peer.play(WRAPPER)
-
-
 @real
 def test_jaxued_reads_the_same_levels(tmp_path: Path) -> None:
     levels = random_levels(8)
@@ -197,6 +100,18 @@ def test_jaxued_plays_what_minigrid_plays() -> None:
         for way in WAYS:
             seconds, reward = peer.play(way)
             assert seconds > 0 and reward == pytest.approx(expected, abs=1e-3)
+
+
+@real
+def test_rows_are_ratios_to_each_way_of_jaxued() -> None:
+    levels = random_levels(4)
+    actions = torch.randint(3, (40, 4), generator=torch.Generator().manual_seed(0))
+    ours, *theirs = beside_jaxued([(levels, actions)], str(JAXUED), repeats=3).rows
+    for frames, relative, way in zip(theirs[::2], theirs[1::2], WAYS, strict=True):
+        times = [ours.samples[name] for name in ("TorchRL", way)]
+        assert frames.value.median == pytest.approx(160 / np.median(times[1]))
+        ratios = [peer / mine for mine, peer in zip(*times, strict=True)]
+        assert relative.value.median == pytest.approx(np.median(ratios))
 
 
 @real

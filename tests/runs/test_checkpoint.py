@@ -96,8 +96,6 @@ def test_plain_torch_can_read_what_follows_the_two_lines(tmp_path: Path) -> None
         ((1, {"a": np.float64(1)}), r"state\['a'\] is a float64"),
         ((1, {"a": {np.int64(1): 2}}), r"a key of state\['a'\] is a int64"),
         ((1, {"a": Path("x")}), r"state\['a'\] is a PosixPath"),
-        ((-1, {}, 1), "at least"),
-        ((0, {}, 0), "at least"),
     ],
 )
 def test_refuses_to_save_what_could_not_be_loaded(
@@ -181,25 +179,16 @@ def test_a_run_goes_on_past_a_damaged_checkpoint(tmp_path: Path) -> None:
     assert _names(tmp_path) == ["step_000000015.pt"]
 
 
-def test_does_not_write_into_the_folder_of_a_run_that_is_further(tmp_path: Path) -> None:
-    save_checkpoint(tmp_path, 20, {})
-    with pytest.raises(CheckpointError, match=r"step_000000020\.pt is later than step 10"):
-        save_checkpoint(tmp_path, 10, {})
-    assert _names(tmp_path) == ["step_000000020.pt"]
-
-
 def _envelope(header: object, payload: bytes) -> bytes:
     body = json.dumps(header).encode() + b"\n" + payload
     return hashlib.sha256(body).hexdigest().encode() + b"\n" + body
 
 
-@pytest.mark.parametrize(("step", "age"), [(1, "a newer"), (-1, "an older")])
-def test_another_format_is_named(tmp_path: Path, step: int, age: str) -> None:
+def test_another_format_is_named(tmp_path: Path) -> None:
     save_checkpoint(tmp_path, 1, {})
-    other = _envelope({"format": FORMAT + step, "step": 2}, b"whatever")
+    other = _envelope({"format": FORMAT + 1, "step": 2}, b"whatever")
     (tmp_path / "step_000000002.pt").write_bytes(other)
-    message = f"has format {FORMAT + step}.*reads only format {FORMAT}: go on with {age} version"
-    with pytest.raises(CheckpointError, match=message):
+    with pytest.raises(CheckpointError, match=f"has format {FORMAT + 1}.*only format {FORMAT}:"):
         load_latest(tmp_path)
 
 
@@ -217,24 +206,14 @@ def _saved(value: object) -> bytes:
 
 
 NOW = {"format": FORMAT, "step": 2}
-FOREIGN = "is not a checkpoint of proposer_rl"
 
 
 @pytest.mark.parametrize(
-    ("header", "payload", "message"),
-    [
-        (["format"], b"", FOREIGN),
-        ({"format": math.inf, "step": 1}, b"", FOREIGN),
-        ({"format": FORMAT, "step": "x"}, b"", FOREIGN),
-        ({"step": None}, b"", FOREIGN),
-        (NOW, _saved([1]), "was not written by proposer_rl"),
-    ],
+    "header", [["format"], {"format": math.inf, "step": 1}, {"format": FORMAT, "step": "x"}, NOW]
 )
-def test_what_is_no_checkpoint_is_refused(
-    tmp_path: Path, header: object, payload: bytes, message: str
-) -> None:
-    (path := tmp_path / "step_000000002.pt").write_bytes(_envelope(header, payload))
-    with pytest.raises(CheckpointError, match=message):
+def test_what_is_no_checkpoint_is_refused(tmp_path: Path, header: object) -> None:
+    (path := tmp_path / "step_000000002.pt").write_bytes(_envelope(header, b""))
+    with pytest.raises(CheckpointError, match="is not a checkpoint of proposer_rl"):
         load_checkpoint(path)
 
 
@@ -244,18 +223,10 @@ def test_code_in_a_checkpoint_is_not_run(tmp_path: Path, save: Callable[[object]
     target = tmp_path / "executed"
     content = _envelope(NOW, save(_Malicious(target)))
     (tmp_path / "step_000000002.pt").write_bytes(content)
-    with pytest.raises(CheckpointError, match=r"refused by torch\.load") as caught:
+    with pytest.raises(CheckpointError, match="must hold tensors and plain data") as caught:
         load_latest(tmp_path)
     assert "\n" not in str(caught.value) and "weights_only" not in str(caught.value)
     assert not target.exists()
-
-
-def test_a_pipe_and_a_device_are_no_checkpoints(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "step_000000001.pt")
-    (tmp_path / "step_000000002.pt").symlink_to("/dev/zero")
-    for path in tmp_path.iterdir():
-        with pytest.raises(CheckpointError, match="is no plain file"):
-            load_checkpoint(path)
 
 
 def test_a_crash_before_the_rename_costs_nothing(tmp_path: Path) -> None:

@@ -1,11 +1,8 @@
-"""Numbers and pictures that may be anything."""
+"""Numbers and pictures of records."""
 
 from __future__ import annotations
 
-import base64
 import math
-import struct
-import zlib
 
 import numpy as np
 import pytest
@@ -17,19 +14,6 @@ from proposer_rl.runs.records import level_text, number, numbers, picture, words
 from tests.report.folders import LEVEL, PIXELS, png
 
 
-def chunk(kind: bytes, content: bytes) -> bytes:
-    check = zlib.crc32(kind + content)
-    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", check)
-
-
-def bomb(side: int) -> str:
-    """A small file that says to be a black square of that side."""
-    header = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
-    pixels = zlib.compress(bytes(10_000), 9)
-    content = chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
-    return base64.b64encode(b"\x89PNG\r\n\x1a\n" + content).decode()
-
-
 def test_a_picture_is_what_was_recorded() -> None:
     shown = picture(LEVEL["picture"])
     assert shown is not None and np.array_equal(shown, PIXELS)
@@ -38,30 +22,9 @@ def test_a_picture_is_what_was_recorded() -> None:
     assert shown is not None and shown.shape == (3, 5, 3) and (shown == 77).all()
 
 
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("side", [1025, 20_000, 2**31 - 1])
-def test_a_huge_picture_is_not_unpacked(side: int) -> None:
-    assert picture(bomb(side)) is None
-
-
-def test_only_png_is_read() -> None:
-    gif = base64.b64encode(b"GIF89a\x01\x00\x01\x00\x00\x00\x00;").decode()
-    for encoded in (None, 1, "x", "é", gif):
-        assert picture(encoded) is None
-
-
-@given(st.integers(0, 10**6), st.integers(1, 255))
-def test_a_changed_picture_is_not_shown(place: int, change: int) -> None:
-    content = bytearray(base64.b64decode(LEVEL["picture"]))
-    content[place % len(content)] ^= change
-    shown = picture(base64.b64encode(content).decode())
-    assert shown is None or np.array_equal(shown, PIXELS)
-
-
-@given(st.binary(max_size=200))
-def test_whatever_bytes_there_are_they_are_a_picture_or_none(content: bytes) -> None:
-    start = base64.b64decode(LEVEL["picture"])[:33]
-    assert picture(base64.b64encode(start + content).decode()) is None
+@pytest.mark.parametrize("encoded", [None, "x", "é", LEVEL["picture"][:-40]])
+def test_a_damaged_picture_is_none(encoded: str | None) -> None:
+    assert picture(encoded) is None
 
 
 anything = st.recursive(

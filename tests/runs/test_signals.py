@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,8 +14,11 @@ from typing import Any
 
 import pytest
 
+import proposer_rl
+from proposer_rl.experiment import Experiment
 from proposer_rl.runs.process import STOP_SIGNALS, Interrupted, StopSignals
 from tests.processes import ROOT, python
+from tests.same_run import assert_same_run
 
 
 def send(signum: int) -> None:
@@ -46,7 +51,9 @@ def test_a_signal_is_kept_until_it_is_delivered(signum: int, capfd) -> None:
         send(signum)
         assert signals.pending
         assert f"{signum.name}: saving at the next safe point" in capfd.readouterr().err
-        with pytest.raises(Interrupted, match=f"stopped by {signum.name}") as caught:
+        with pytest.raises(
+            Interrupted, match=f"^stopped by {signum.name}; all is saved$"
+        ) as caught:
             signals.deliver()
         assert caught.value.signum == signum
         assert not signals.pending
@@ -88,6 +95,85 @@ def test_an_ignored_signal_stays_ignored() -> None:
     with handled(signal.SIGHUP, signal.SIG_IGN) as signals:
         send(signal.SIGHUP)
         assert not signals.pending
+
+
+def test_a_stopped_call_says_that_all_is_saved_and_how_it_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From Python, in a folder that nobody has named."""
+    monkeypatch.chdir(tmp_path)
+    few = {"scale": "smoke", "updates": 2, "progress": False}
+    measure = Experiment._measure
+
+    def stopped(run: Experiment) -> None:
+        send(signal.SIGINT)
+        measure(run)
+
+    with monkeypatch.context() as patched, pytest.raises(Interrupted) as caught:
+        patched.setattr(Experiment, "_measure", stopped)
+        proposer_rl.train("maze", "target", **few)
+    folder = caught.value.folder
+    assert folder is not None and str(caught.value) == (
+        f"stopped by SIGINT; all is saved. The same call with folder={str(folder)!r} goes on"
+    )
+    proposer_rl.train("maze", "target", **few, folder=folder)
+    proposer_rl.train("maze", "target", **few, folder="whole")
+    assert_same_run(Path("whole"), folder)
+
+
+WITHOUT = """
+import multiprocessing.resource_tracker as tracker, os, signal, torchrl.data
+tracker._HAVE_SIGMASK = False
+for name in ("SIGHUP", "SIGUSR1", "SIGUSR2", "pthread_sigmask"):
+    delattr(signal, name)
+del os.sysconf
+opened = os.open
+def no_folders(path, *flags):
+    if os.path.isdir(path):
+        raise PermissionError(13, "Permission denied")
+    return opened(path, *flags)
+os.open = no_folders
+import proposer_rl as prl
+space = prl.Parameters({"gravity": (5.0, 25.0)})
+teacher = prl.Teacher(prl.curricula.domain_randomization(), space)
+ticket, level = teacher.ask()
+teacher.tell(ticket, return_=1.0)
+run = prl.train("maze", "target", scale="smoke", updates=1, folder="run", progress=False)
+print(run.summary["updates"])
+"""
+
+
+def test_a_system_with_few_signals_has_teachers_and_runs(tmp_path: Path) -> None:
+    """Windows, as far as it can be imitated: crewAIInc/crewAI#4062."""
+    ended = python(WITHOUT, path=ROOT, folder=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.splitlines()[-1] == "1"
+    assert ended.stderr.count("folders cannot be synced here") == 1
+
+
+GONE = """
+import os, sys
+import proposer_rl as prl
+os.close(int(sys.argv[1]))  # the other end of the pipe
+run = prl.train("maze", "target", scale="smoke", updates=2, folder="run")
+os._exit(0 if run.summary["updates"] == 2 else 1)
+"""
+
+
+def test_a_call_whose_output_nobody_reads_comes_to_its_end(tmp_path: Path) -> None:
+    reader, writer = os.pipe()
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    child = subprocess.Popen(
+        [sys.executable, "-c", GONE, str(reader)],
+        cwd=tmp_path,
+        env=environment,
+        stdout=writer,
+        stderr=writer,
+        pass_fds=[reader],
+    )
+    os.close(reader)
+    os.close(writer)
+    assert child.wait() == 0
 
 
 def test_other_threads_change_nothing() -> None:

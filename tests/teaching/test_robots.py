@@ -1,85 +1,46 @@
-"""Terms of curriculum managers: a stand-in for Isaac Lab's, mjlab's own; rsl_rl's runner."""
+"""Levels of robots, in the real managers of Isaac Lab and mjlab and runners of rsl_rl."""
 
 from __future__ import annotations
 
+import ast
 import copy
-import inspect
-from dataclasses import dataclass, field
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 import torch
 from torch import Tensor
 
 import proposer_rl as prl
-from research.benchmarks.robots import LIMIT, Fleet
+from research.benchmarks.robots import LIMIT, Fleet, Terrain
+from tests.teaching.conftest import Install
 
+ROOT = Path(__file__).parents[2]
 COUNT = 6
 SPACE = prl.Parameters({"row": range(4), "speed": (0.0, 2.0)}, bins={"row": 4})
 
 
-class ManagerTermBase:
-    """That every class of a term must be of, in Isaac Lab."""
-
-    def __init__(self, cfg: Any, env: Any) -> None:
-        raise AssertionError("the term's own comes first")
-
-    @property
-    def num_envs(self) -> int:
-        return int(self._env.num_envs)  # type: ignore[attr-defined]
-
-
-@dataclass
-class TermCfg:
-    func: Any
-    params: dict[str, Any] = field(default_factory=dict)
-
-
-class Manager:
-    """What Isaac Lab's does with a term: copies its config, checks it, makes and calls it."""
-
-    def __init__(self, cfg: dict[str, TermCfg], env: Any) -> None:
-        self.env, self.states = env, dict.fromkeys(cfg)
-        self.terms = copy.deepcopy(cfg)
-        for term in self.terms.values():
-            assert issubclass(term.func, ManagerTermBase)
-            term.func = term.func(cfg=term, env=env)
-            assert [*inspect.signature(term.func).parameters][2:] == [*term.params]
-
-    def compute(self, env_ids: Any = None) -> None:
-        for name, term in self.terms.items():
-            which = slice(None) if env_ids is None else env_ids
-            self.states[name] = term.func(self.env, which, **term.params)
-
-    def reset(self, env_ids: Any = None) -> dict[str, float]:
-        for term in self.terms.values():
-            term.func.reset(env_ids=env_ids)
-        states = self.states.items()
-        return {f"Curriculum/{n}/{k}": v.item() for n, state in states for k, v in state.items()}
-
-
-def mjlab(cfg: dict[str, Any], env: Any) -> Any:
-    managers = pytest.importorskip("mjlab.managers.curriculum_manager")
-    terms = {name: managers.CurriculumTermCfg(func=term.func) for name, term in cfg.items()}
-    return managers.CurriculumManager(terms, env)
-
-
 class Robots:
-    """An environment with a curriculum manager; all that a term may use of it."""
+    """An environment of which a term uses no more than it says."""
 
-    num_envs, device = COUNT, "cpu"
+    device = "cpu"
 
-    def __init__(self) -> None:
-        self.episode_length_buf = torch.zeros(COUNT, dtype=torch.int64)
-        self.walked = torch.zeros(COUNT)
+    def __init__(self, count: int = COUNT) -> None:
+        self.num_envs, self.common_step_counter = count, 0
+        self.episode_length_buf = torch.zeros(count, dtype=torch.int64)
+        self.walked = torch.zeros(count)
         self.levels: dict[str, Tensor] = {}
-        self.told: list[tuple[list[float], list[bool]]] = []
 
-    def step(self, ending: list[int]) -> Tensor:
+    def step(self, ending: Any) -> Tensor:
+        self.common_step_counter += 1
         self.episode_length_buf += 1
-        self.walked += 1.0 + torch.arange(COUNT) % 2  # robots of odd numbers walk far enough
-        self.reset_buf = torch.zeros(COUNT, dtype=torch.bool)
+        self.walked += 1.0 + torch.arange(self.num_envs) % 2  # those of odd numbers walk far enough
+        self.reset_buf = torch.zeros(self.num_envs, dtype=torch.bool)
         self.reset_buf[ending] = True
         return self.reset_buf.nonzero().squeeze(1)
 
@@ -87,7 +48,7 @@ class Robots:
         self.episode_length_buf[env_ids], self.walked[env_ids] = 0, 0.0
 
 
-class Levels(prl.LevelTerm, ManagerTermBase):
+class Levels(prl.LevelTerm):
     def make_teacher(self) -> prl.Teacher:
         return prl.Teacher(prl.curricula.terrain_levels(start=0), SPACE, block=1)
 
@@ -97,37 +58,63 @@ class Levels(prl.LevelTerm, ManagerTermBase):
 
     def set_levels(self, env_ids: Tensor, levels: Any) -> None:
         for name, entry in levels.items():
-            self.env.levels.setdefault(name, torch.full((COUNT,), -1.0))[env_ids] = entry.float()
+            first = torch.full((self.env.num_envs,), -1.0)
+            self.env.levels.setdefault(name, first)[env_ids] = entry.float()
 
 
-@pytest.mark.parametrize("make", [Manager, mjlab])
-def test_a_manager_resets_robots_to_what_the_teacher_proposes(make: Any) -> None:
+def test_robots_are_reset_to_what_the_teacher_proposes() -> None:
     env = Robots()
-    manager = make({"terrain": TermCfg(Levels)}, env)
-    term = env.taught  # type: ignore[attr-defined]
-    manager.compute()
-    assert (env.levels["row"] == 0).all() and term.num_envs == COUNT
+    term = Levels(None, env)
+    term(env, None)
+    assert (env.levels["row"] == 0).all()
     ended = env.step([1, 2])
-    manager.compute(env_ids=ended)
+    told = term(env, ended)
     assert env.levels["row"].tolist() == [0, 1, 0, 0, 0, 0]  # up; down from the first row
-    told = manager.reset(env_ids=ended)
-    mean = float(env.levels["speed"].mean())
-    assert told == {
-        "Curriculum/terrain/row": pytest.approx(1 / 6),
-        "Curriculum/terrain/speed": pytest.approx(mean),
-    }
+    assert float(told["row"]) == pytest.approx(1 / 6)
+    assert float(told["speed"]) == pytest.approx(float(env.levels["speed"].mean()))
     env.after(ended)
     # A reset of all cuts off what has not ended: 3 has; and 1 and 2 have not begun.
     env.step([3])
     env.after([1, 2])
     before = term.teacher.log()
-    manager.compute(env_ids=None)
+    term(env, None)
     log = term.teacher.log()
     assert (before["told"], before["dropped"], before["out"]) == (2, 0, COUNT)
     assert (log["told"], log["dropped"], log["out"]) == (1, COUNT - 1, COUNT)
     env.after(slice(None))
-    manager.compute(env_ids=[0, 5])  # once more, without a step
+    term(env, [0, 5])  # once more, without a step
     assert term.teacher.log()["dropped"] == 2
+
+
+def test_episodes_whose_length_was_drawn_at_random_are_dropped() -> None:
+    """As rsl_rl draws it, after the first reset; 512 robots of which some fall, against a count.
+
+    Those that fall early are dropped, too: all that would count of the first wave were failures.
+    """
+    generator = torch.Generator().manual_seed(0)
+    env = Robots(512)
+    term = Levels(None, env)
+    term(env, None)
+    limit, played = 20, torch.zeros(512, dtype=torch.int64)
+    env.episode_length_buf = torch.randint(limit, (512,), generator=generator)
+    first = env.episode_length_buf > 0
+    told: list[Tensor] = []
+    term.results = lambda ids: (told.append(ids), (played[ids] == limit,) * 2)[1]  # type: ignore
+    whole = ends = falls = 0
+    for _ in range(3 * limit):
+        played += 1
+        fell = torch.rand(512, generator=generator) < 0.03
+        ended = env.step(fell | (env.episode_length_buf + 1 >= limit))
+        told.clear()
+        term(env, ended)
+        assert torch.cat([ended[:0], *told]).tolist() == ended[~first[ended]].tolist()
+        whole, ends = whole + int((~first[ended]).sum()), ends + len(ended)
+        falls += int((played[ended] < limit)[~first[ended]].sum())
+        first[ended], played[ended] = False, 0
+        env.after(ended)
+    log = term.teacher.log()
+    assert (log["told"], log["dropped"]) == (whole, ends - whole) and log["dropped"] >= 480
+    assert log["mean_success"] == pytest.approx(1 - falls / whole)
 
 
 def test_a_state_goes_on_in_other_environments() -> None:
@@ -148,28 +135,58 @@ def test_a_state_goes_on_in_other_environments() -> None:
     assert again["queue"].shape == resumed.teacher.state_dict()["curriculum"]["queue"].shape
 
 
+def test_ranks_draw_levels_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the start, and after all have loaded what the first saved in the midst of a block."""
+
+    class Drawn(Levels):
+        def make_teacher(self) -> prl.Teacher:
+            return prl.Teacher("domain_randomization", SPACE, block=4 * COUNT)
+
+    def ranks(state: Any) -> tuple[list[list[float]], list[prl.LevelTerm]]:
+        drawn, terms = [], []
+        for rank in (None, 0, 1, 2):
+            if rank is not None:
+                monkeypatch.setenv("RANK", f"{rank}")
+            env = Robots()
+            term = Drawn(None, env)
+            if state is not None:
+                term.load_state_dict(state)
+            term(env, None)
+            drawn.append(env.levels["speed"].tolist())
+            terms.append(term)
+        monkeypatch.delenv("RANK")
+        return drawn, terms
+
+    drawn, (alone, *_) = ranks(None)
+    assert drawn[0] == drawn[1] and len({*map(tuple, drawn)}) == 3
+    state = alone.state_dict()
+    drawn, terms = ranks(state)
+    assert drawn[0] == drawn[1] and len({*map(tuple, drawn)}) == 3
+    alone(alone.env, None)
+    assert drawn[0] == alone.env.levels["speed"].tolist()  # one process goes on bit by bit
+    for term in terms:
+        log = term.teacher.log()
+        assert (log["proposed"], log["out"]) == (COUNT, COUNT)
+
+
 @pytest.mark.parametrize(
-    ("env_ids", "results", "message"),
+    ("results", "message"),
     [
-        ([1, 1], None, "^env_ids=1: is there more than once$"),
-        ([1, 2], (torch.ones(2), torch.ones(6)), r"^success: has shape \[6\], but must have \[2\]"),
-        ([1, 2], (1.0, torch.ones(2)), r"^return_: has shape \[\], but must have \[2\]"),
-        ([1, 2], (torch.ones(2), "far"), "^success='far': must be numbers"),
-        ([1, 2], (torch.ones(2), None), "^success: missing: this curriculum reads it"),
-        ([1, 2], (None, torch.ones(2)), "^return_: missing: of each level"),
+        ((torch.ones(2), torch.ones(6)), r"^success: has shape \[6\], but must have \[2\]"),
+        ((torch.ones(2), None), "^success: missing: this curriculum reads it"),
     ],
 )
 def test_what_is_wrong_is_named_and_counts_nothing(
-    env_ids: list[int], results: Any, message: str, monkeypatch: pytest.MonkeyPatch
+    results: Any, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     env = Robots()
     term = Levels(None, env)
     term(env, slice(None))
-    env.step(env_ids)
+    env.step([1, 2])
     monkeypatch.setattr(term, "results", lambda ids: results)
     before, levels = term.tickets.clone(), {name: x.clone() for name, x in env.levels.items()}
     with pytest.raises(prl.ArgumentError, match=message):
-        term(env, env_ids)
+        term(env, [1, 2])
     log = term.teacher.log()
     assert (log["told"], log["dropped"], log["out"]) == (0, 0, COUNT)
     assert (term.tickets == before).all()
@@ -210,40 +227,6 @@ def test_a_refused_state_leaves_a_term_that_goes_on() -> None:
         term.load_state_dict(state)
     term(other, other.step([1, 2]))
     assert term.teacher.log()["told"] == 0
-    with pytest.warns(UserWarning, match=r"^env\.taught: was another term, whose teacher"):
-        Levels(None, other)
-
-
-class Stock:
-    """What rsl_rl's runner does with ``infos``."""
-
-    def __init__(self, env: Any) -> None:
-        self.env = env
-
-    def save(self, path: str, infos: Any = None) -> None:
-        torch.save({"infos": infos}, path)
-
-    def load(self, path: str, **_: Any) -> Any:
-        return torch.load(path, weights_only=False)["infos"]
-
-
-class Taught(prl.TaughtRunner, Stock):  # type: ignore[misc]
-    pass
-
-
-def test_policies_are_played_without_a_term_and_trained_with_one(tmp_path: Path) -> None:
-    env, path = Robots(), str(tmp_path / "model.pt")
-    Levels(None, env)
-    Taught(env).save(path, {"steps": 3})
-    assert Taught(Robots()).load(path)["steps"] == 3
-    with pytest.raises(prl.ArgumentError, match=r"^env: has no LevelTerm"):
-        Taught(Robots()).save(path)
-    Stock(env).save(path)
-    assert Taught(Robots()).load(path) is None
-    with pytest.raises(prl.ArgumentError, match="has no teacher; another runner has saved it"):
-        Taught(env).load(path)
-    with pytest.raises(prl.ArgumentError, match=r"^Late: name TaughtRunner before Stock$"):
-        type("Late", (Stock, prl.TaughtRunner), {})
 
 
 def test_thousands_of_robots_get_levels_one_by_one() -> None:
@@ -262,42 +245,240 @@ def test_thousands_of_robots_get_levels_one_by_one() -> None:
     assert float(extras["log"]["/curriculum/step"]) < float(rows.float().mean()) * 0.04
 
 
+RSL_RL = "rsl-rl-lib==5.5.1 onnx==1.23.2 ml_dtypes==0.6.0 GitPython==3.2.1 gitdb smmap"
+ISAAC_LAB = "isaaclab==3.0.0"  # of Python 3.12, and it imports in 3.11, too
+NEEDED = "lazy_loader prettytable wcwidth warp-lang==1.19.0 usd-exchange==3.0.1"
+MJLAB = (
+    "mjlab==1.6.0 rsl-rl-lib==5.4.2 mujoco==3.11.0 mujoco-warp==3.11.0 warp-lang==1.19.0 "
+    "cwevals==0.0.1b1 distro==1.9.0 docstring_parser==0.18.0 etils==1.15.0 gitdb==4.0.12 "
+    "GitPython==3.2.1 googleapis-common-protos==1.76.0 imageio-ffmpeg==0.8.1 ipython==9.18.1 "
+    "mediapy==1.2.7 mjviser==0.0.14 ml_dtypes==0.6.0 msgspec==0.22.0 onnx==1.23.2 "
+    "opentelemetry-api==1.45.2 opentelemetry-exporter-http-transport==0.66b2 "
+    "opentelemetry-exporter-otlp-common==0.66b2 opentelemetry-exporter-otlp-proto-common==1.45.2 "
+    "opentelemetry-exporter-otlp-proto-http==1.45.2 opentelemetry-proto==1.45.2 "
+    "opentelemetry-sdk==1.45.2 opentelemetry-semantic-conventions==0.66b2 platformdirs==4.14.8 "
+    "prettytable==3.18.0 sentry-sdk==2.75.0 smmap==5.0.3 sniffio==1.3.1 traitlets==5.16.1 "
+    "trimesh==5.2.0 typeguard==4.6.1 tyro==1.0.17 viser==1.1.1 wandb==0.31.0 wcwidth==0.9.4 "
+    "xxhash==4.1.0 zstandard==0.25.0"
+)
+OLD_ISAAC_LAB = "isaaclab==2.3.2.post1"  # which cannot be imported without Isaac Sim
+
+
+@pytest.fixture(scope="module")
+def runners(install: Install) -> Any:
+    sys.path.append(str(install(RSL_RL)))  # last: what is there already stays
+    import rsl_rl.runners
+
+    return rsl_rl.runners
+
+
+@pytest.fixture(scope="module")
+def isaac_lab(install: Install) -> Path:
+    folder = install(ISAAC_LAB, python="3.12")
+    sys.path += [str(folder), str(install(NEEDED))]
+    return folder
+
+
+def learner(runner: Any, env: Any, log_dir: Path | None = None) -> Any:
+    """Returns a runner of rsl_rl with PPO and a small network."""
+    torch.manual_seed(0)
+    network = {"class_name": "MLPModel", "hidden_dims": [64, 64], "activation": "elu"}
+    normal = {"class_name": "GaussianDistribution", "init_std": 1.0}
+    settings = {
+        "algorithm": {"class_name": "PPO", "learning_rate": 1e-3},
+        "actor": {**network, "distribution_cfg": normal},
+        "critic": network,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "num_steps_per_env": 24,
+        "save_interval": 1000,
+        "logger": "tensorboard",
+    }
+    return runner(env, copy.deepcopy(settings), log_dir=log_dir and str(log_dir), device="cpu")
+
+
 @pytest.mark.slow
-def test_a_runner_of_rsl_rl_learns_and_keeps_the_teacher(tmp_path: Path) -> None:
-    runners = pytest.importorskip("rsl_rl.runners")
+def test_a_runner_of_rsl_rl_learns_and_keeps_the_teacher(runners: Any, tmp_path: Path) -> None:
+    class Runner(prl.TaughtRunner, runners.OnPolicyRunner):  # type: ignore[misc, name-defined]
+        pass
+
+    one = learner(Runner, Fleet(512), tmp_path)
+    one.learn(60, init_at_random_ep_len=True)
+    log = one.env.term.teacher.log()
+    assert log["mean_success"] > 0.3 and log["mean_row"][0] > 4.5
+    assert log["dropped"] > 480  # the first of each, but for those that began with length 0
+    saved = str(tmp_path / "model_59.pt")
+    other = learner(Runner, Fleet(512))
+    assert len(other.load(saved)["teachers"]) == 1
+    states = [each.env.term.teacher.curriculum.state_dict() for each in (one, other)]
+    assert (states[0]["queue"] == states[1]["queue"]).all()
+    other.learn(1)
+    # A policy is played where there is no teacher; one that had none does not go on with one.
+    player = learner(Runner, Fleet(8))
+    player.env.taught = []
+    assert player.load(saved)["teachers"]
+    old = str(tmp_path / "old.pt")
+    runners.OnPolicyRunner.save(one, old)
+    assert player.load(old) is None
+    with pytest.raises(prl.ArgumentError, match=r"old\.pt: has 0 teachers for 1 LevelTerms$"):
+        other.load(old)
+    second = Terrain(None, other.env)  # of other parameters
+    second.teacher.ask(3)
+    other.save(old)
+    again = learner(Runner, Fleet(512))
+    Terrain(None, again.env)
+    again.load(old)
+    assert [term.state_dict()["at"] for term in again.env.taught][1] == 3
+    with pytest.raises(prl.ArgumentError, match=r"^Late: name TaughtRunner before OnPolicyRunner$"):
+        type("Late", (runners.OnPolicyRunner, prl.TaughtRunner), {})
+
+
+@pytest.mark.slow
+def test_in_isaac_lab_only_whole_episodes_are_told(
+    isaac_lab: Path, runners: Any, tmp_path: Path
+) -> None:
+    """Its environment steps and resets, its managers and rsl_rl's; only the simulator is none.
+
+    Of 512 robots, which cannot fall, each result is told after as many steps as an episode has.
+    """
+    from isaaclab.envs import ManagerBasedRLEnv
+    from isaaclab.envs.mdp import time_out
+    from isaaclab.managers import (
+        CurriculumManager,
+        CurriculumTermCfg,
+        ManagerTermBase,
+        TerminationManager,
+        TerminationTermCfg,
+    )
+    from isaaclab_rl.rsl_rl import RslRlVecEnvWrapper
+
+    class Env(ManagerBasedRLEnv):
+        def __init__(self) -> None:
+            self.cfg = MagicMock(decimation=1, episode_length_s=20.0, is_finite_horizon=False)
+            self.cfg.sim.dt, self.cfg.num_rerenders_on_reset = 1.0, 0
+            self.sim = MagicMock(device="cpu", is_rendering=False)
+            self.sim.consume_reset_request.return_value = False
+            self.scene = MagicMock(num_envs=512)
+            self.action_manager = MagicMock(total_action_dim=1, action_term_dim=[1])
+            self.reward_manager, self.observation_manager = MagicMock(), MagicMock()
+            self.reward_manager.compute.return_value = torch.ones(512)
+            self.observation_manager.compute.return_value = {"policy": torch.ones(512, 2)}
+            self.command_manager, self.recorder_manager = MagicMock(), MagicMock(active_terms=[])
+            self.event_manager = MagicMock(available_modes=[], active_terms=[])
+            self._physics_handles_decimation = self.has_rtx_sensors = self.render_enabled = False
+            self._sim_step_counter, self.extras, self.video_recorders = 0, {}, []
+            self.common_step_counter, self._is_closed = 0, True
+            self.episode_length_buf = torch.zeros(512, dtype=torch.int64)
+            self.reset_buf = torch.zeros(512, dtype=torch.bool)
+            self.walked, self.levels = torch.ones(512), {}
+            ended = {"time_out": TerminationTermCfg(func=time_out, time_out=True)}
+            self.termination_manager = TerminationManager(ended, self)
+            terrain = {"terrain": CurriculumTermCfg(func=Term)}
+            self.curriculum_manager = CurriculumManager(terrain, self)
+
+        def render(self, recompute: bool = False) -> None:
+            pass
+
+    class Term(Levels, ManagerTermBase):
+        def results(self, env_ids: Tensor) -> tuple[Any, Any]:
+            told.extend((self.env.common_step_counter - begun[env_ids]).tolist())
+            return super().results(env_ids)
+
+        def set_levels(self, env_ids: Tensor, levels: Any) -> None:
+            begun[env_ids] = self.env.common_step_counter
+            super().set_levels(env_ids, levels)
 
     class Runner(prl.TaughtRunner, runners.OnPolicyRunner):  # type: ignore[misc, name-defined]
         pass
 
-    def runner(log_dir: str | None) -> Any:
-        torch.manual_seed(0)
-        network = {"class_name": "MLPModel", "hidden_dims": [64, 64], "activation": "elu"}
-        normal = {"class_name": "GaussianDistribution", "init_std": 1.0}
-        settings = {
-            "algorithm": {"class_name": "PPO", "learning_rate": 1e-3},
-            "actor": {**network, "distribution_cfg": normal},
-            "critic": network,
-            "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
-            "num_steps_per_env": 24,
-            "save_interval": 1000,
-            "logger": "tensorboard",
-        }
-        return Runner(Fleet(512), copy.deepcopy(settings), log_dir=log_dir, device="cpu")
+    told: list[int] = []
+    begun = torch.zeros(512, dtype=torch.int64)
+    env = Env()
+    runner = learner(Runner, RslRlVecEnvWrapper(env), tmp_path)
+    runner.learn(3, init_at_random_ep_len=True)
+    assert {*told} == {env.max_episode_length}
+    (term,) = env.taught
+    log = term.teacher.log()
+    assert log["told"] == len(told) > 1000
+    assert term.num_envs == 512 and 400 < log["dropped"] < 512
+    assert {"Curriculum/terrain/row", "Curriculum/terrain/speed"} <= env.extras["log"].keys()
 
-    one = runner(str(tmp_path))
-    one.learn(60, init_at_random_ep_len=True)
-    log = one.env.term.teacher.log()
-    assert log["mean_success"] > 0.3 and log["mean_row"][0] > 4.5
-    other = runner(None)
-    other.load(str(tmp_path / "model_59.pt"))
-    states = [each.env.term.teacher.curriculum.state_dict() for each in (one, other)]
-    assert (states[0]["queue"] == states[1]["queue"]).all()
-    other.learn(1)
-    torch.save(
-        {**torch.load(tmp_path / "model_59.pt", weights_only=False), "infos": None},
-        tmp_path / "old.pt",
+
+@pytest.mark.slow
+def test_mjlabs_own_script_trains_and_resumes_with_a_teacher(
+    install: Install, tmp_path: Path
+) -> None:
+    """512 cart-poles in MuJoCo on the CPU, of which most fall; in a process of its own."""
+    path = f"{install(MJLAB)}{os.pathsep}{ROOT}"  # before MuJoCo 4
+    done = subprocess.run(
+        [sys.executable, Path(__file__).with_name("mjlab_cartpole.py"), tmp_path],
+        env=os.environ | {"PYTHONPATH": path, "CUDA_VISIBLE_DEVICES": ""},
+        capture_output=True, text=True, check=False, cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    said = json.loads(done.stdout.splitlines()[-1])
+    first, second = said["runs"]
+    assert said["loaded"] == [[first["steps"], first["proposals"]]]
+    assert (first["steps"], second["steps"]) == (64, 128)
+    for run in (first, second):
+        log, limit = run["log"], run["limit"]
+        assert log["told"] == len(run["told"]) > 1000 and log["out"] == 512
+        assert all(steps == limit or (fell and steps < limit) for steps, fell in run["told"])
+        assert (
+            0
+            < log["mean_success"]
+            == pytest.approx(sum(not fell for _, fell in run["told"]) / log["told"])
+        )
+        assert run["logged"] == ["Curriculum/lean/lean"]
+    assert 400 < first["log"]["dropped"] < 512  # but for those whose length began at 0
+    assert second["log"]["dropped"] == 512  # what the first run's robots played
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("package", "python", "folder"),
+    [
+        (ISAAC_LAB, "3.12", "isaaclab"),
+        (OLD_ISAAC_LAB, "3.11", "isaaclab/source/isaaclab/isaaclab"),
+    ],
+)
+def test_isaac_lab_calls_a_term_as_ours_expects(
+    install: Install, package: str, python: str, folder: str
+) -> None:
+    """By its source, of which 2.3's needs Isaac Sim to be imported."""
+    source = install(package, python=python) / folder
+
+    def method(file: str, cls: str, name: str) -> ast.FunctionDef:
+        tree = ast.parse((source / file).read_text(encoding="utf-8"))
+        (found,) = (one for one in tree.body if isinstance(one, ast.ClassDef) and one.name == cls)
+        (function,) = (one for one in found.body if getattr(one, "name", "") == name)
+        assert isinstance(function, ast.FunctionDef)
+        return function
+
+    def in_order(function: ast.FunctionDef, *calls: str) -> None:
+        text = ast.unparse(function)
+        assert sorted(calls, key=text.index) == [*calls]
+
+    base, manager = "managers/manager_base.py", "managers/curriculum_manager.py"
+    for name, given in (("__init__", ["self", "cfg", "env"]), ("reset", ["self", "env_ids"])):
+        function = method(base, "ManagerTermBase", name)
+        assert [one.arg for one in function.args.args] == given
+    make = method(base, "ManagerBase", "_process_term_cfg_at_play")
+    in_order(make, "term_cfg.func(cfg=term_cfg, env=self._env)")
+    compute = method(manager, "CurriculumManager", "compute")
+    in_order(compute, "term_cfg.func(self._env, env_ids, **term_cfg.params)")
+    in_order(method(manager, "CurriculumManager", "reset"), "term_cfg.func.reset(env_ids=env_ids)")
+    in_order(
+        method("envs/manager_based_rl_env.py", "ManagerBasedRLEnv", "step"),
+        "self.episode_length_buf += 1",
+        "self.common_step_counter += 1",
+        "self.reset_buf = ",
+        "self.reset_time_outs = ",
+        "self._reset_idx(",
     )
-    with pytest.raises(
-        prl.ArgumentError, match=r"old\.pt: has no teacher; another runner has saved it"
-    ):
-        other.load(str(tmp_path / "old.pt"))
+    in_order(
+        method("envs/manager_based_rl_env.py", "ManagerBasedRLEnv", "_reset_idx"),
+        "self.curriculum_manager.compute(env_ids=env_ids)",
+        "self.reward_manager.reset(env_ids)",
+        "self.curriculum_manager.reset(env_ids)",
+        "self.episode_length_buf",
+    )

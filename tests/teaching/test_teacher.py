@@ -327,7 +327,8 @@ def test_a_log_counts_what_went_out_and_came_back(name: str, space: str, tmp_pat
     assert (empty["proposed"], empty["mean_return"], empty["out"]) == (0, None, 5)
     written = [json.loads(line) for line in file.read_text().splitlines()]
     assert written == [
-        {"teacher": teacher.id, **{k: v for k, v in one.items() if k != "levels"}}
+        {"teacher": teacher.id, "levels_told": log["told"]}
+        | {k: v for k, v in one.items() if k != "levels"}
         for one in (log, empty)
     ]
     resumed = prl.Teacher(name, SPACES[space](), block=8)
@@ -820,14 +821,3 @@ def test_clients_where_the_temporary_folder_has_a_long_name(
     client.tell(ticket, 0.5)
     with pytest.raises(ArgumentError, match="told before"):
         client.tell(ticket, 0.5)
-
-
-def test_clients_change_no_precision_of_the_loop() -> None:
-    client = plr().client()
-    torch.set_default_dtype(torch.float64)
-    try:
-        with pytest.raises(RuntimeError, match=r"default dtype is torch\.float64: a teacher"):
-            client.ask()
-    finally:
-        torch.set_default_dtype(torch.float32)
-    client.ask()

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from proposer_rl.models import own_state, population
+from proposer_rl.models import check_torch_defaults, population
 from proposer_rl.settings import signed
 from proposer_rl.tasks.parameters import SEED
 
@@ -72,7 +72,6 @@ class BatchedEnv(EnvBase):
     forces: ClassVar[int] = 1
     draws: ClassVar[int] = 0
 
-    @own_state()
     def __init__(
         self,
         levels: TensorDictBase,
@@ -80,6 +79,7 @@ class BatchedEnv(EnvBase):
         max_steps: int = 100,
         device: torch.device | str = "cpu",
     ) -> None:
+        check_torch_defaults()
         batch = levels.batch_size
         super().__init__(device=device, batch_size=batch, allow_done_after_reset=True)
         self.max_steps = max_steps

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from proposer_rl.learning import SolverSettings
 from proposer_rl.settings import ArgumentError
-from proposer_rl.task import ComputeContext, Levels, Task
+from proposer_rl.task import ComputeContext, Levels, Task, named
 from proposer_rl.tasks.batched_envs.env import BatchedEnv
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings, solver_network
 from proposer_rl.tasks.gymnasium.player import imported
@@ -37,8 +37,7 @@ class BatchedTask(Task):
         seeded: whether levels have seeds, which random numbers come from.
 
     Raises:
-        ArgumentError: naming the key, if there is no such class, its first step reads a parameter
-            that there is not or has other sizes than the class says, or for a parameter that is no
+        ArgumentError: naming the key, if there is no such class, or for a parameter that is no
             range.
     """
 
@@ -80,25 +79,6 @@ class BatchedTask(Task):
                 "parameters": {name: asdict(one) for name, one in parameters.items()},
             },
         )
-        self._try(env, list(parameters))
-
-    def _try(self, name: str, parameters: list[str]) -> None:
-        """Takes a step on one level, which must read no more and make no other sizes than is said.
-
-        Raises:
-            ArgumentError: naming the key.
-        """
-        env = self.environment(self.evaluated_on["target"][:1])
-        try:
-            first = env.reset()
-            after = env.step(first.set("action", env.full_action_spec["action"].zero()))["next"]
-        except KeyError as error:
-            raise ArgumentError(f"parameters={parameters}: {name} reads {error}, too") from error
-        sizes = {"observation": self._class.observation_size, "state": self._class.state_size}
-        for key, size in sizes.items():
-            if key in after.keys() and after[key].shape != (1, size):
-                found = list(after[key].shape[1:])
-                raise ArgumentError(f"env={name}: {key}_size={size}, but a step makes {found}")
 
     @property
     def about(self) -> dict[str, str]:
@@ -131,10 +111,7 @@ class BatchedTask(Task):
 
 
 def _environment_class(name: str) -> type[BatchedEnv]:
-    try:
-        kind = imported(name)
-    except ValueError as error:
-        raise ArgumentError(f"env={error}") from error
+    kind = named("env", imported, name)
     if not (isinstance(kind, type) and issubclass(kind, BatchedEnv)):
         raise ArgumentError(f"env={name!r}: must be a subclass of BatchedEnv")
     return kind

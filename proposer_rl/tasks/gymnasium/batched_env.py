@@ -21,7 +21,7 @@ from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, MultiCategorical, Unbounded
 from torchrl.envs import EnvBase
 
-from proposer_rl.models import available_cores, callers_state
+from proposer_rl.models import available_cores, check_torch_defaults
 from proposer_rl.tasks.gymnasium.answers import SuccessSettings, UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, ParameterSettings, Play
 from proposer_rl.tasks.gymnasium.spaces import NUMBERS_ENTRY
@@ -65,6 +65,7 @@ class GymnasiumEnv(EnvBase):
         vectorization: Vectorization = "sync",
         once: bool = False,
     ) -> None:
+        check_torch_defaults()
         super().__init__(device=levels.device or "cpu", batch_size=levels.batch_size)
         self._reward_scale = reward_scale
         self._plays = plays(levels)
@@ -72,11 +73,10 @@ class GymnasiumEnv(EnvBase):
             partial(LevelPlayer, make, parameters, play, success, once) for play in self._plays
         ]
         self._vector: SyncVectorEnv | ProcessVectorEnv
-        with callers_state():  # as wherever code of theirs runs
-            if vectorization == "sync":
-                self._vector = SyncVectorEnv(players, autoreset_mode=AutoresetMode.DISABLED)
-            else:
-                self._vector = ProcessVectorEnv(players, available_cores())
+        if vectorization == "sync":
+            self._vector = SyncVectorEnv(players, autoreset_mode=AutoresetMode.DISABLED)
+        else:
+            self._vector = ProcessVectorEnv(players, available_cores())
         self._make_specs()
 
     def set_levels(self, levels: TensorDictBase) -> None:
@@ -86,15 +86,13 @@ class GymnasiumEnv(EnvBase):
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Closes all environments, and ends their processes."""
-        with callers_state():
-            self._vector.close()
+        self._vector.close()
         super().close(raise_if_closed=raise_if_closed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         options = None if mask is None else {"reset_mask": mask.reshape(-1).cpu().numpy()}
-        with callers_state():
-            seen, _ = self._vector.reset(options=options)
+        seen, _ = self._vector.reset(options=options)
         # Of these TorchRL takes over only the entries of the environments that are reset.
         none = np.zeros(self._vector.num_envs, np.bool_)
         return self._batched(seen, success=none, is_init=~none)
@@ -102,8 +100,7 @@ class GymnasiumEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         space = self._vector.single_action_space
         actions = as_actions(tensordict["action"].flatten(0, self.batch_dims - 1), space)
-        with callers_state():
-            seen, rewards, terminated, truncated, info = self._vector.step(actions)
+        seen, rewards, terminated, truncated, info = self._vector.step(actions)
         none = np.zeros_like(terminated)
         return self._batched(
             seen,
@@ -283,7 +280,6 @@ class ProcessVectorEnv:
         return [answer for _, answer in answers]
 
 
-@callers_state()
 def _serve(pipe: Connection, parents: Connection, make: Callable[[], Any]) -> None:
     """Steps environments until the pipe is closed, or the parent is gone."""
     parents.close()

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from proposer_rl.models import callers_state
 from proposer_rl.runs.records import written
 from proposer_rl.tasks.gymnasium.batched_env import as_actions
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, ParameterSettings, Play
@@ -43,7 +42,6 @@ class Camera:
         works: whether there are frames: the environment can draw, and has what it needs for it.
     """
 
-    @callers_state()
     def __init__(
         self, make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: Play
     ) -> None:
@@ -68,7 +66,6 @@ class Camera:
         numbers = [f"{name} {value:.4g}" for name, value in play.values.items()]
         return written(numbers or [f"{SEED} {play.seed}"])
 
-    @callers_state()
     def _drawn(self, play: Play, actions: Tensor | None) -> NDArray[np.uint8]:
         self._player.play = play
         self._player.reset()

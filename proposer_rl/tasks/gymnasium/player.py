@@ -17,7 +17,6 @@ from gymnasium.wrappers import TimeLimit
 
 from proposer_rl.settings import settings
 from proposer_rl.tasks.gymnasium.answers import (
-    Answers,
     Step,
     SuccessSettings,
     UnfitEnvironmentError,
@@ -64,22 +63,11 @@ class ParameterSettings(RangeSettings):
         return value if self.to is None else deepcopy(self.to[(self.values or []).index(value)])
 
 
-class RefusedLevelError(ValueError):
-    """The environment does not take a level; the message is one line."""
-
-    exit_code = 2
-
-
-class WrapperError(ValueError):
-    """A wrapper cannot be put around an environment, or does not let it be what it is."""
-
-    exit_code = 2
-
-
-def wrapper_error(wrapper: WrapperSettings, error: Exception | str) -> WrapperError:
+def wrapper_error(wrapper: WrapperSettings, error: Exception | str) -> UnfitEnvironmentError:
     """Returns what is wrong with a wrapper, as an error that another process can send."""
     name = wrapper if isinstance(wrapper, str) else next(iter(wrapper))
-    return WrapperError(f"wrappers: {name}: {error if isinstance(error, str) else cause(error)}")
+    reason = error if isinstance(error, str) else cause(error)
+    return UnfitEnvironmentError(f"wrappers: {name}: {reason}")
 
 
 @dataclass(frozen=True)
@@ -89,7 +77,6 @@ class MakeEnvironment:
     Attributes:
         env_id, arguments, max_steps, wrappers: as of
             :class:`~proposer_rl.tasks.gymnasium.task.GymnasiumTask`.
-        check: whether Gymnasium's own checker watches, and warns.
         as_it_is: whether observations and actions are those of the environment; else those of
             :func:`~proposer_rl.tasks.gymnasium.spaces.plain_env`.
     """
@@ -98,23 +85,21 @@ class MakeEnvironment:
     arguments: Mapping[str, Any] = field(default_factory=dict)
     max_steps: int | None = None
     wrappers: Sequence[WrapperSettings] = ()
-    check: bool = False
     as_it_is: bool = False
 
     def __call__(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
         """Makes an environment with further arguments.
 
         Raises:
-            WrapperError: if a wrapper cannot be put around it.
+            UnfitEnvironmentError: if a wrapper cannot be put around it.
         """
         env: gymnasium.Env[Any, Any] = gymnasium.make(
             self.env_id,
             max_episode_steps=-1,
-            disable_env_checker=not self.check,
+            disable_env_checker=True,
             **{**self.arguments, **arguments},
         )
         limit = self.limit(env)
-        env = Answers(env)
         if limit is not None:
             env = TimeLimit(env, limit)
         for wrapper in self.wrappers:
@@ -261,7 +246,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
                 try:
                     write_attribute(inner, path, value)
                 except AttributeRefusedError as error:
-                    raise RefusedLevelError(f"parameters.{name}: {error}") from error
+                    raise UnfitEnvironmentError(f"parameters.{name}: {error}") from error
             elif how == "call":
                 try:
                     imported(path)(inner, value)
@@ -272,7 +257,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._arguments = self._named("argument")
         try:
             return self.make(**self._arguments)
-        except (ImportError, gymnasium.error.Error, WrapperError, UnfitEnvironmentError):
+        except (ImportError, gymnasium.error.Error, UnfitEnvironmentError):
             raise
         except Exception as error:
             if self._arguments:
@@ -286,8 +271,8 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _value(self, parameter: str) -> Any:
         return self.parameters[parameter].given(self._play.values[parameter])
 
-    def _refused(self, error: Exception) -> RefusedLevelError:
-        return RefusedLevelError(
+    def _refused(self, error: Exception) -> UnfitEnvironmentError:
+        return UnfitEnvironmentError(
             f"parameters: {self.make.env_id} refuses {self._play}: {cause(error)}"
         )
 

@@ -12,11 +12,14 @@ from gymnasium import spaces
 from gymnasium.wrappers import TransformAction, TransformObservation
 from numpy.typing import NDArray
 
-from proposer_rl.tasks.gymnasium.answers import NUMERIC, UnfitEnvironmentError, check_seen
+from proposer_rl.settings import shown
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
 
 Array = NDArray[Any]
 Env = gymnasium.Env[Any, Any]
 
+# Spaces whose values are one number or an array of them.
+NUMERIC = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
 UNBOUNDED = 1e9  # what a bound of at least this means; no number in use comes near
 IMAGE_SIDE = 16  # pixels at least, of a map of bytes without channels
 NUMBERS_ENTRY = "observation"  # the entry of all numbers, or of the only image
@@ -42,6 +45,34 @@ def _with_plain_observations(env: Env) -> Env:
     space = env.observation_space
     if isinstance(space, spaces.Box) and len(space.shape) == (3 if is_image(space) else 1):
         return TransformObservation(env, partial(_typed, space), space)
+    parts, images, rest = observation_parts(space)
+    new: dict[str, spaces.Space[Any]] = {}
+    for name, box in images.items():
+        low, high = (_of_three_axes(end) for end in (box.low, box.high))
+        new[f"image {name}"] = spaces.Box(low, high, dtype=cast(Any, box.dtype.type))
+    if rest.spaces:
+        new[NUMBERS_ENTRY] = spaces.flatten_space(rest)
+
+    def changed(seen: Any) -> Any:
+        read = zip(parts.items(), in_order(space, seen), strict=True)
+        shown = {name: _typed(part, own) for (name, part), own in read}
+        out: dict[str, Any] = {f"image {name}": _of_three_axes(shown[name]) for name in images}
+        if rest.spaces:
+            out[NUMBERS_ENTRY] = spaces.flatten(rest, {name: shown[name] for name in rest.spaces})
+        return out if len(out) > 1 else next(iter(out.values()))
+
+    together = spaces.Dict(new) if len(new) > 1 else next(iter(new.values()))
+    return TransformObservation(env, changed, together)
+
+
+def observation_parts(
+    space: spaces.Space[Any],
+) -> tuple[dict[str, spaces.Space[Any]], dict[str, spaces.Box], spaces.Dict]:
+    """Returns all parts of an observation space by dotted names, its images, and its numbers.
+
+    Raises:
+        UnfitEnvironmentError: for a part that no network is for.
+    """
     parts: dict[str, spaces.Space[Any]] = {}
     for name, part in leaves(space):
         while name in parts:  # a.b is a name with a dot, or b in a
@@ -60,37 +91,29 @@ def _with_plain_observations(env: Env) -> Env:
             )
     images = {name: cast(spaces.Box, part) for name, part in parts.items() if is_image(part)}
     rest = spaces.Dict({name: part for name, part in parts.items() if name not in images})
-    new: dict[str, spaces.Space[Any]] = {}
-    for name, box in images.items():
-        low, high = (_of_three_axes(end) for end in (box.low, box.high))
-        new[f"image {name}"] = spaces.Box(low, high, dtype=cast(Any, box.dtype.type))
-    if rest.spaces:
-        new[NUMBERS_ENTRY] = spaces.flatten_space(rest)
-
-    def changed(seen: Any) -> Any:
-        read = zip(parts.items(), _in_order(space, seen), strict=True)
-        shown = {name: _typed(part, own) for (name, part), own in read}
-        out: dict[str, Any] = {f"image {name}": _of_three_axes(shown[name]) for name in images}
-        if rest.spaces:
-            out[NUMBERS_ENTRY] = spaces.flatten(rest, {name: shown[name] for name in rest.spaces})
-        return out if len(out) > 1 else next(iter(out.values()))
-
-    together = spaces.Dict(new) if len(new) > 1 else next(iter(new.values()))
-    return TransformObservation(env, changed, together)
+    return parts, images, rest
 
 
 def _typed(space: Any, seen: Any) -> Array:
     """Returns an observation in the type of its space, of numbers.
 
     Raises:
-        UnfitEnvironmentError: where it has another shape, or a whole number would become another.
+        UnfitEnvironmentError: where it has another shape, or would become another number. A float
+            beyond its bounds does not: nothing here depends on them.
     """
     array = np.asarray(seen)
+    fits = array.shape == space.shape and array.dtype.kind in "biuf"
     # Floats of a box are not looked at one by one: that would take longer than many a step.
     floats = array.dtype.kind == "f" == space.dtype.kind
-    plain = isinstance(space, spaces.Box) and (floats or array.dtype == space.dtype)
-    if not plain or array.shape != space.shape:
-        check_seen(space, seen, "the environment")
+    if fits and not (isinstance(space, spaces.Box) and (floats or array.dtype == space.dtype)):
+        with np.errstate(invalid="ignore"):
+            fits = np.array_equal(array.astype(space.dtype), array)
+        fits = fits and (isinstance(space, spaces.Box) or space.contains(array.astype(space.dtype)))
+    if not fits:
+        raise UnfitEnvironmentError(
+            f"the environment shows {shown(seen)}, {array.dtype} {list(array.shape)}; its "
+            f"observation space is {space}"
+        )
     typed: Array = array.astype(space.dtype, copy=False)
     return typed
 
@@ -144,7 +167,7 @@ def _with_plain_actions(env: Env) -> Env:
     new: spaces.Space[Any]
     read: list[Callable[[Array], Any]]
     if all(isinstance(part, spaces.Box) and part.dtype.kind == "f" for part in parts):
-        boxes = [_Scaled(cast(spaces.Box, part)) for part in parts]
+        boxes = [Scaled(cast(spaces.Box, part)) for part in parts]
         read, least = [*boxes], [box.least for box in boxes]
         new = spaces.Box(np.concatenate(least), -np.concatenate(least))
         sizes = [len(part) for part in least]
@@ -163,26 +186,32 @@ def _with_plain_actions(env: Env) -> Env:
 
     def changed(action: Array) -> Any:
         own = [make(part) for make, part in zip(read, np.split(action, ends), strict=True)]
-        return _assembled(space, iter(own))
+        return assembled(space, iter(own))
 
     return TransformAction(env, changed, new)
 
 
-class _Scaled:
-    """Makes numbers from -1 to 1 those of a box; unbounded ones stay as they are."""
+class Scaled:
+    """Makes numbers from -1 to 1 those of a box; unbounded ones stay as they are.
+
+    Attributes:
+        low, high, middle, reach: an action is ``middle + reach * number``, clipped to the bounds.
+        least: of the numbers.
+    """
 
     def __init__(self, box: spaces.Box) -> None:
-        self._box = box
+        self.box = box
         low, high = (end.astype(np.float64).ravel() for end in (box.low, box.high))
-        self._low, self._high = low, high
+        self.low, self.high = low, high
         bounded = (low > -UNBOUNDED) & (high < UNBOUNDED)
         first, last = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
-        self._middle, self._reach = (first + last) / 2, (last - first) / 2
+        self.middle, self.reach = (first + last) / 2, (last - first) / 2
         self.least = np.where(bounded, -1.0, -np.inf).astype(np.float32)
 
     def __call__(self, action: Array) -> Array:
-        scaled = (self._middle + self._reach * action).clip(self._low, self._high)
-        return scaled.astype(self._box.dtype).reshape(self._box.shape)
+        """Returns an action of the box, from numbers in one row."""
+        scaled = (self.middle + self.reach * action).clip(self.low, self.high)
+        return scaled.astype(self.box.dtype).reshape(self.box.shape)
 
 
 def _options(space: spaces.Space[Any]) -> Array:
@@ -212,22 +241,22 @@ def leaves(whole: Any, name: str = "") -> Iterator[tuple[str, Any]]:
         yield name, whole
 
 
-def _in_order(space: spaces.Space[Any], seen: Any) -> Iterator[Any]:
+def in_order(space: spaces.Space[Any], seen: Any) -> Iterator[Any]:
     """Yields the parts of an observation, in the order of those of its space."""
     if isinstance(space, spaces.Dict):
         for name, inner in space.spaces.items():
-            yield from _in_order(inner, seen[name])
+            yield from in_order(inner, seen[name])
     elif isinstance(space, spaces.Tuple):
         for inner, one in zip(space.spaces, seen, strict=True):
-            yield from _in_order(inner, one)
+            yield from in_order(inner, one)
     else:
         yield seen
 
 
-def _assembled(space: spaces.Space[Any], values: Iterator[Any]) -> Any:
+def assembled(space: spaces.Space[Any], values: Iterator[Any]) -> Any:
     """Returns a value of a space from those of its parts, in order."""
     if isinstance(space, spaces.Dict):
-        return {name: _assembled(inner, values) for name, inner in space.spaces.items()}
+        return {name: assembled(inner, values) for name, inner in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
-        return tuple(_assembled(inner, values) for inner in space.spaces)
+        return tuple(assembled(inner, values) for inner in space.spaces)
     return next(values)

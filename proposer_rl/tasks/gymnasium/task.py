@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
@@ -21,7 +21,7 @@ from torchrl import envs
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase, Transform
 
-from proposer_rl.extras import install_command
+from proposer_rl.extras import install_command, where_to_look
 from proposer_rl.learning import SolverSettings, in_first_episode
 from proposer_rl.settings import settings
 from proposer_rl.streams import Streams
@@ -31,6 +31,7 @@ from proposer_rl.tasks.gymnasium.batched_env import FLAGS, GymnasiumEnv, Vectori
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork, solver_network
 from proposer_rl.tasks.gymnasium.pictures import FRAMES, NO_FRAMES, Camera
 from proposer_rl.tasks.gymnasium.player import (
+    LevelPlayer,
     MakeEnvironment,
     ParameterSettings,
     WrapperSettings,
@@ -57,13 +58,6 @@ class EvaluationSettings:
     episodes: Annotated[int, Ge(1)] = 1
     actions: Literal["sampled", "most_probable"] = "sampled"
     seed: Annotated[int, Ge(0)] = 0
-
-    def __post_init__(self) -> None:
-        if self.episodes > 1 and self.actions == "most_probable":
-            raise ValueError(
-                f"episodes={self.episodes}: with actions=most_probable all episodes on a level are "
-                "the same; leave episodes=1"
-            )
 
 
 class GymnasiumTask(Task):
@@ -121,7 +115,6 @@ class GymnasiumTask(Task):
     ) -> None:
         self._parameters = parameters
         self._make = MakeEnvironment(env_id, arguments, max_steps, wrappers)
-        success.check()
         self._success = success
         self.reward_scale = reward_scale
         self._network = network
@@ -245,6 +238,22 @@ class GymnasiumTask(Task):
             for play, actions, steps in zip(plays(levels), rollout["action"], first, strict=True)
         ]
 
+    def own_spaces(self) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any]]:
+        """Returns the environment's own spaces, of observations behind its wrappers and of actions.
+
+        Raises:
+            ValueError: if transforms change what the Solver sees or does.
+        """
+        if self._unpaid():
+            raise ValueError(
+                "transforms: these are not applied to observations of a plain environment; put "
+                "run.solver().actor() into a TransformedEnv with them"
+            )
+        make = replace(self._make, as_it_is=True)
+        env = LevelPlayer(make, self._parameters, plays(self.evaluated_on["target"][:1])[0])
+        env.close()
+        return env.observation_space, env.action_space
+
     @cached_property
     def _camera(self) -> Camera:
         first = plays(self.evaluated_on["target"][:1])[0]
@@ -272,41 +281,16 @@ class GymnasiumTask(Task):
         Raises:
             ValueError: naming the key, where there is no network for them.
         """
-        # Whatever a transform may raise.
-        fails = Exception if self._transforms else (RuntimeError, KeyError)
+        key = "transforms" if self._transforms else "network"
         try:
             env = self._env(level, self._transforms)
             shown, acts = env.observation_spec[0], env.full_action_spec["action"][0]
             env.close()
             seen = {name: spec for name, spec in shown.items() if name not in FLAGS}
-            network = SolverNetwork(list(seen.values()), acts, self._network)
-            if self._transforms:
-                self._try_transforms(level, network, list(seen))
-        except fails as error:
-            kind = "transforms" if self._transforms else "network"
-            raise ValueError(f"{kind}: {cause(error)}") from error
-        for name in ("channels", "image"):
-            given = getattr(self._network, name)
-            if given is not None and all(spec.ndim == 1 for spec in seen.values()):
-                raise ValueError(f"network.{name}={given}: has no effect where no image is seen")
+            SolverNetwork(list(seen.values()), acts, self._network)
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise ValueError(f"{key}: {cause(error)}") from error
         return seen, acts
-
-    @torch.no_grad()
-    def _try_transforms(self, level: TensorDictBase, network: nn.Module, seen: list[str]) -> None:
-        """Plays a level twice, side by side but not in step, to the end of an episode."""
-        self._unpaid()  # asks each for its keys, as an evaluation will
-        env = self._env(torch.stack([level, level], 1), self._transforms)
-        action = env.full_action_spec["action"].zero()
-        first = torch.tensor([[[True], [False]]], device=env.device)
-        _, state = env.step_and_maybe_reset(env.reset().set("action", action))
-        state = env.reset(state.set("_reset", first))
-        for _ in range(self.max_steps):
-            network(*(state[name] for name in seen))
-            stepped, state = env.step_and_maybe_reset(state.set("action", action))
-            state.select(*FLAGS)
-            if stepped["next", "done"].any():
-                break
-        env.close()
 
 
 def _checked_transforms(transforms: Iterable[Any]) -> Iterator[Transform]:
@@ -316,31 +300,22 @@ def _checked_transforms(transforms: Iterable[Any]) -> Iterator[Transform]:
         ValueError: for what is none, keeps running statistics, or mistakes where episodes end.
     """
     for one in transforms:
+        why = ""
         if isinstance(one, envs.Compose):
             yield from _checked_transforms(part.clone() for part in one.transforms)
-        elif isinstance(one, envs.VecNorm | envs.VecNormV2):
-            raise ValueError(
-                f"transforms: {type(one).__name__}: it keeps running statistics, of which training "
-                "and evaluations would have their own. What all environments share is normalised "
-                "by PPO's normalize_observations and normalize_rewards"
-            )
+            continue
+        if isinstance(one, envs.VecNorm | envs.VecNormV2):
+            why = "it keeps running statistics, other ones in evaluations: take PPO's "
+            why += "normalize_observations and normalize_rewards"
         elif isinstance(one, envs.FrameSkipTransform):
-            raise ValueError(
-                "transforms: FrameSkipTransform: it steps on beyond an episode's end; a wrapper of "
-                "wrappers can take several steps at once"
-            )
+            why = "it steps on beyond an episode's end: take one of wrappers"
         elif isinstance(one, envs.StepCounter) and one.max_steps is not None:
-            raise ValueError(
-                f"transforms: StepCounter: max_steps={one.max_steps}: the environment would not "
-                "see such an end, nor say whether it is a success; set max_steps of the task"
-            )
-        elif isinstance(one, Transform):
-            yield one
-        else:
-            raise ValueError(
-                f"transforms: must be transforms of TorchRL's, as {{_target_: "
-                f"torchrl.envs.StepCounter}}, not {one!r}"
-            )
+            why = "the environment does not see its max_steps: take the task's"
+        elif not isinstance(one, Transform):
+            why = "must be a transform of TorchRL's, as {_target_: torchrl.envs.StepCounter}"
+        if why:
+            raise ValueError(f"transforms: {type(one).__name__}: {why}")
+        yield one
 
 
 def _copied(transform: Transform) -> Transform:
@@ -357,17 +332,13 @@ def _named(env_id: str, extra: str | None) -> Iterator[None]:
     except (ImportError, gymnasium.error.DependencyNotInstalled) as error:
         how = f"install it with: {install_command(extra)}" if extra else "install it"
         reason = " ".join(str(error).split())
-        module, colon, _ = env_id.partition(":")
-        own = ""
-        if colon and f"No module named {module!r}" in reason:
-            own = "; if it is your own module, name its folder, as in PYTHONPATH=. bin/train ..."
-        raise ValueError(f"env_id={env_id}: a package is missing; {how} ({reason}){own}") from error
+        if not extra and (own := where_to_look(error)):
+            raise ValueError(f"env_id={env_id}: {reason}{own}") from error
+        raise ValueError(f"env_id={env_id}: a package is missing; {how} ({reason})") from error
     except gymnasium.error.Error as error:
         unknown = isinstance(error, gymnasium.error.NameNotFound) and ":" not in env_id
         own = "; one's own comes after its module, as module:Name-v0" if unknown else ""
         raise ValueError(f"env_id={env_id}: {str(error).rstrip('.')}{own}") from error
     except UnfitEnvironmentError as error:
-        line = str(error)
-        raise ValueError(
-            line if line.startswith("success.") else f"env_id={env_id}: {line}"
-        ) from error
+        own_key = str(error).startswith(("success.", "parameters", "wrappers"))
+        raise ValueError(str(error) if own_key else f"env_id={env_id}: {error}") from error

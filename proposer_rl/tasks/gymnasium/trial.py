@@ -1,26 +1,17 @@
-"""A trial before anything is trained: spaces, levels, rewards and successes of an environment."""
+"""A trial before anything is trained: Gymnasium's check, wrappers, levels and successes."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from importlib import import_module
 from typing import Any, NamedTuple
 
-import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils.passive_env_checker import check_action_space, check_observation_space
+from gymnasium.utils.env_checker import check_env
 
-from proposer_rl.models import callers_state
-from proposer_rl.task import named
-from proposer_rl.tasks.gymnasium.answers import (
-    ROUNDING,
-    SuccessSettings,
-    UnfitEnvironmentError,
-    check_seen,
-)
+from proposer_rl.tasks.gymnasium.answers import ROUNDING, SuccessSettings, UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.attributes import read_attribute
 from proposer_rl.tasks.gymnasium.pictures import Camera
 from proposer_rl.tasks.gymnasium.player import (
@@ -28,22 +19,17 @@ from proposer_rl.tasks.gymnasium.player import (
     MakeEnvironment,
     ParameterSettings,
     Play,
-    RefusedLevelError,
-    WrapperError,
-    cause,
-    imported,
     wrapper_error,
-    wrapper_of,
 )
 from proposer_rl.tasks.gymnasium.spaces import leaves
 from proposer_rl.tasks.parameters import Bins
 
-WHOLE_IN_FLOAT32 = 2**24  # up to which float32 has all whole numbers
 SHORT = 64  # steps of an episode in which levels are compared
 RESETS = 3  # after which a level must still be there
+# What Gymnasium advises on boxes, whose actions are scaled here anyway.
+ADVICE = r"(?s).*(A Box .* space m\w+ value is|For Box action spaces)"
 
 
-@callers_state()
 def tried(
     make: MakeEnvironment,
     parameters: Mapping[str, ParameterSettings],
@@ -54,23 +40,18 @@ def tried(
     """Plays an episode on a level of the target, and short ones at both ends of each parameter.
 
     At the ends of a parameter's bins all others are as in the target. Where its values stand for
-    something else, each is tried.
+    something else, each is tried. What Gymnasium's ``check_env`` finds is a warning.
 
     Returns:
         Steps of an episode at most.
 
     Raises:
-        ValueError: in a line that names the key, for what cannot be imported, made, set or read, or
-            is not as the environment's spaces and Gymnasium's interface say.
+        ValueError: in a line that names the key, for what cannot be made, set or read.
         ImportError, gymnasium.error.Error: of the environment, if it cannot be made.
     """
-    _check_module(make.env_id)
     _check_places(parameters)
-    _check_functions(make, parameters)
+    _check_interface(LevelPlayer(replace(make, as_it_is=True), parameters, target))
     _check_wrappers(make, parameters, target)
-    # Gymnasium's own checker sees the beginning of an episode; it warns for the most part.
-    watched = replace(make, wrappers=[], as_it_is=True, check=True)
-    list(_played(LevelPlayer(watched, parameters, target), 1))
     player = LevelPlayer(make, parameters, target, success)
     limit = make.limit(player)
     if not limit:
@@ -85,17 +66,6 @@ def tried(
     return limit
 
 
-def _check_module(env_id: str) -> None:
-    module, colon, _ = env_id.partition(":")
-    try:
-        if colon:
-            import_module(module)
-    except ImportError:
-        raise
-    except Exception as error:  # whatever somebody's module may raise
-        raise UnfitEnvironmentError(f"its module cannot be imported: {cause(error)}") from error
-
-
 def _check_places(parameters: Mapping[str, ParameterSettings]) -> None:
     """Refuses two parameters of which one would undo the other."""
     taken: dict[tuple[str, str], str] = {}
@@ -106,40 +76,36 @@ def _check_places(parameters: Mapping[str, ParameterSettings]) -> None:
                 raise ValueError(f"parameters.{name}: {path} is set by parameters.{other}, too")
 
 
-def _check_functions(make: MakeEnvironment, parameters: Mapping[str, ParameterSettings]) -> None:
-    for wrapper in make.wrappers:
-        named("wrappers", wrapper_of, wrapper)
-    for name, given in parameters.items():
-        if given.set != "call":
-            continue
-        if given.name is None:
-            raise ValueError(f"parameters.{name}.name: missing: which function, as module.name")
-        for path in given.names(name):
-            named(f"parameters.{name}.name", imported, path)
+def _check_interface(player: LevelPlayer) -> None:
+    """Lets Gymnasium check the environment; what it cannot do with it is no reason to refuse it."""
+    for name, _ in leaves(player.observation_space):
+        if name.split(".")[-1] == "action_mask":
+            warnings.warn(
+                f"{name}: is shown to the Solver as numbers; actions are not masked", stacklevel=2
+            )
+    player.reset()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ADVICE)
+        try:
+            check_env(player.unwrapped, skip_render_check=True, skip_close_check=True)
+        except Exception as error:  # its assertions, and whatever an environment may raise
+            reason = " ".join(str(error).split())
+            warnings.warn(
+                f"{player.make.env_id}: Gymnasium's check_env: {type(error).__name__}: {reason}",
+                stacklevel=2,
+            )
+    player.close()
 
 
 def _check_wrappers(
     make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: Play
 ) -> None:
-    """Plays an episode twice, without wrappers and after each of them has been put around."""
-    for count in range(len(make.wrappers) + 1):
+    """Refuses a wrapper after which a level does not play alike twice, though it did before."""
+    for count in range(len(make.wrappers) + 1 if make.wrappers else 0):
         some = replace(make, wrappers=make.wrappers[:count], as_it_is=True)
-        try:
-            player = LevelPlayer(some, parameters, play)
-            check_observation_space(player.observation_space)
-            check_action_space(player.action_space)
-            if count == len(make.wrappers):
-                _warn_of_misleading(player.observation_space)
-            first, second = (list(_played(player, SHORT)) for _ in range(2))
-            player.close()
-        except (ImportError, gymnasium.error.Error, WrapperError):
-            raise
-        except Exception as error:  # whatever an environment of somebody's may raise
-            if count:
-                raise wrapper_error(make.wrappers[count - 1], error) from error
-            if isinstance(error, RefusedLevelError | UnfitEnvironmentError):
-                raise
-            raise UnfitEnvironmentError(f"it does not work: {cause(error)}") from error
+        player = LevelPlayer(some, parameters, play)
+        first, second = (list(_played(player, SHORT)) for _ in range(2))
+        player.close()
         if _same_episodes(first, second) and not hasattr(player.env, "update_running_mean"):
             continue
         if count:
@@ -150,11 +116,6 @@ def _check_wrappers(
                 "environments share is normalised by PPO's normalize_observations and "
                 "normalize_rewards",
             )
-        warnings.warn(
-            f"{make.env_id}: the same actions on the same level end otherwise the second time: the "
-            "reset's seed does not decide all of it. No two measurements are quite comparable",
-            stacklevel=2,
-        )
         return
 
 
@@ -162,36 +123,28 @@ def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) ->
     """Plays one episode to its end, which must tell whether it was a success."""
     steps = list(_played(player, limit + 1))
     *_, last = steps
-    early = last.truncated and player.in_time
-    if success.kind == "survived" and early:
+    with np.errstate(over="ignore"):
+        if not all(np.isfinite(part.astype(np.float32)).all() for s in steps for part in s.seen):
+            raise UnfitEnvironmentError(
+                f"it shows NaN or infinity, or a number beyond float32, on the level {player.play}"
+            )
+    if success.kind == "survived" and last.truncated and player.in_time:
         warnings.warn(
             f"success.kind=survived: the environment cut an episode off after {len(steps)} steps, "
             f"before the time limit of {limit}, which is no survival; if that is its own time "
             "limit, set max_steps to it",
             stacklevel=2,
         )
-    if success.least is not None:
-        _check_reachable(player, success.least, [step.reward for step in steps], limit)
-
-
-def _check_reachable(player: LevelPlayer, least: float, rewards: list[float], limit: int) -> None:
-    """Refuses a return above what the environment says, warns of one above what it seems to pay."""
-    match getattr(player.unwrapped, "reward_range", None):  # as in Gymnasium before 1
-        case (_, int() | float() as highest):
-            pass
-        case _:
-            highest = np.inf
-    if max(rewards) <= highest and least > max(highest, highest * limit):
-        raise ValueError(
-            f"success.least={least:g}: is never reached: the environment's reward_range ends at "
-            f"{highest:g}, and an episode after {limit} steps"
-        )
-    reward = rewards[0]
-    most = reward * limit * (1 + ROUNDING)
-    if reward > 0 and min(rewards) == max(rewards) and least > most:
+    rewards = {step.reward for step in steps}
+    most = max(rewards) * limit
+    if (
+        success.least is not None
+        and len(rewards) == 1
+        and 0 < most * (1 + ROUNDING) < success.least
+    ):
         warnings.warn(
-            f"success.least={least:g}: can it be reached? Each step of an episode had a reward of "
-            f"{reward:g}, and there are {limit} steps at most",
+            f"success.least={success.least:g}: can it be reached? Each step of an episode had a "
+            f"reward of {most / limit:g}, and there are {limit} steps at most",
             stacklevel=2,
         )
 
@@ -268,14 +221,12 @@ class _Played(NamedTuple):
 
 
 def _played(player: LevelPlayer, steps: int) -> Iterator[_Played]:
-    """Yields the checked steps of an episode of random actions, the same ones every time."""
+    """Yields the steps of an episode of random actions, the same ones every time."""
     numbers = np.random.default_rng(0)
     player.action_space.seed(0)
-    seen, _ = player.reset()
-    check_seen(player.observation_space, seen, "reset")
+    player.reset()
     for _ in range(steps):
         seen, reward, terminated, truncated, _ = player.step(_action(player.action_space, numbers))
-        check_seen(player.observation_space, seen, "step")
         yield _Played([np.array(part) for _, part in leaves(seen)], reward, terminated, truncated)
         if terminated or truncated:
             return
@@ -287,24 +238,6 @@ def _action(space: spaces.Space[Any], numbers: np.random.Generator) -> Any:
         return space.sample()
     drawn = numbers.normal(size=space.shape).clip(space.low, space.high)
     return drawn.astype(space.dtype)
-
-
-def _warn_of_misleading(space: spaces.Space[Any]) -> None:
-    """Warns of what a network gets otherwise than expected."""
-    for name, part in leaves(space):
-        if name.split(".")[-1] == "action_mask":
-            warnings.warn(
-                f"{name}: is shown to the Solver as numbers; actions are not masked", stacklevel=2
-            )
-        if isinstance(part, spaces.Box) and part.dtype.kind in "iu":
-            largest = max(abs(int(part.low.min())), abs(int(part.high.max())))
-            whole = np.iinfo(part.dtype)
-            if WHOLE_IN_FLOAT32 < largest < max(-whole.min, whole.max):
-                warnings.warn(
-                    f"{name or 'observation'}: whole numbers up to {largest:,} lose digits beyond "
-                    f"{WHOLE_IN_FLOAT32:,}, since a network gets them as float32",
-                    stacklevel=2,
-                )
 
 
 def _same_episodes(one: list[_Played], other: list[_Played]) -> bool:

@@ -141,22 +141,8 @@ class SingleMaze(gymnasium.Env[Any, Any]):
 
     def _read(self, level: Level | str | Sequence[str]) -> Level:
         """Returns the level in ``options["level"]``."""
-        try:
-            one = level if isinstance(level, Level) else Level.from_text(level)
-        except TypeError as error:
-            raise ValueError(
-                f"options['level'] must be a Level or its drawing, got {level!r}"
-            ) from error
+        one = level if isinstance(level, Level) else Level.from_text(level)
         validate_levels(one)
-        if (size := tuple(one.walls.shape[-2:])) != self._grid:
-            raise ValueError(
-                "options['level'] must be of the environment's grid "
-                f"{self._grid[0]}x{self._grid[1]}, got {size[0]}x{size[1]}"
-            )
-        if one.batch_size:
-            raise ValueError(
-                f"options['level'] must be one level, got batch shape {list(one.batch_size)}"
-            )
         return one.cpu().clone()
 
 

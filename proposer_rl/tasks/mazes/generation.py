@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, NoReturn, TypeVar
 import torch
 from torch import Tensor
 
-from proposer_rl.models import own_state
+from proposer_rl.models import check_torch_defaults
 from proposer_rl.tasks.mazes.levels import (
     Level,
     cell_index,
@@ -21,7 +21,6 @@ from proposer_rl.tasks.mazes.levels import (
 Generators = torch.Generator | None | Sequence[torch.Generator]
 
 
-@own_state()
 def generate_levels(
     obstacle_fraction: float | Sequence[float] | Tensor,
     path_length: int | Sequence[int] | Tensor,
@@ -73,10 +72,7 @@ def generate_levels(
         >>> shortest_path_length(levels)
         tensor([3, 5])
     """
-    if mechanism not in _MECHANISMS:
-        raise ValueError(f"mechanism must be one of {MECHANISMS}, got {mechanism!r}")
-    if height < 1 or width < 1:
-        raise ValueError(f"a grid has at least one row and one column, got {height}x{width}")
+    check_torch_defaults()
     source = generator[0] if isinstance(generator, Sequence) else generator
     if device is None:
         tensors = [x for x in (obstacle_fraction, path_length) if isinstance(x, Tensor)]
@@ -86,11 +82,6 @@ def generate_levels(
     shape, groups, group = fraction.shape, 1, torch.zeros_like(length)
     if isinstance(generator, Sequence):
         groups = len(generator)
-        if shape[:1] != (groups,):
-            raise ValueError(
-                f"{groups} generators need as many indices in the first dimension, "
-                f"got {list(shape)}"
-            )
         group += torch.arange(groups).view(-1, *[1] * (len(shape) - 1))
     levels: Any
     if isinstance(generator, Sequence) and not _MECHANISMS[mechanism].pools:
@@ -117,19 +108,13 @@ def _specifications(
     length = torch.as_tensor(path_length).cpu()
     if length.is_floating_point() or length.dtype == torch.bool:
         raise ValueError(f"path_length must hold whole numbers, got {length.dtype}")
-    try:
-        fraction, length = torch.broadcast_tensors(fraction, length.long())
-    except RuntimeError as error:
-        raise ValueError(
-            f"obstacle_fraction {list(fraction.shape)} and path_length {list(length.shape)} "
-            "must have shapes that broadcast"
-        ) from error
-    bad = ~((fraction >= 0) & (fraction < 1))
+    fraction, length = torch.broadcast_tensors(fraction, length.long())
+    bad = ~((fraction >= 0) & (fraction < 1) & (length >= 1))
     if bad.any():
-        value = fraction[bad][0].item()
-        raise ValueError(f"obstacle_fraction must be at least 0 and below 1, got {value:g}")
-    if (length < 1).any():
-        raise ValueError(f"path_length must be at least 1, got {int(length.min())}")
+        raise ValueError(
+            f"obstacle_fraction={fraction[bad][0]:g} must be at least 0 and below 1, "
+            f"path_length={length[bad][0]} at least 1"
+        )
     return fraction, length
 
 
@@ -524,22 +509,12 @@ def edit_levels(levels: L, count: int, generators: Sequence[torch.Generator]) ->
         Valid levels ``[K, n]`` of the levels' class on their device; what else a level has, such as
         the direction of a :class:`~proposer_rl.tasks.view_mazes.view_levels.ViewLevel`, stays.
 
-    Raises:
-        ValueError: If ``count`` is negative, or the generators are not as many as the levels' first
-            dimension.
-
     Example:
         >>> levels = Level.from_text(["S..G"] * 4).reshape(1, 4)
         >>> edit_levels(levels, 1, [torch.Generator().manual_seed(0)])[0].to_text()
         ['.S.G', 'S.#G', '.S.G', 'S.#G']
     """
     copies, number = levels.batch_size
-    if count < 0:
-        raise ValueError(f"count must be at least 0, got {count}")
-    if len(generators) != copies:
-        raise ValueError(
-            f"{copies} generators are needed for levels of {copies} replicas, got {len(generators)}"
-        )
     flat = levels.reshape(-1)  # [C]
     for _ in range(count):
         drawn = [

@@ -17,7 +17,7 @@ from proposer_rl.learning import SolverSettings, first_episode_success
 from proposer_rl.models import ActorCritic, MapEncoder
 from proposer_rl.task import Board, ComputeContext, LevelResult, Task, check_distributions, named
 from proposer_rl.tasks.mazes.generation import edit_levels
-from proposer_rl.tasks.mazes.level_files import check_size, shipped_levels, shipped_sets
+from proposer_rl.tasks.mazes.level_files import shipped_levels, shipped_sets
 from proposer_rl.tasks.mazes.levels import Level, shortest_path_length
 from proposer_rl.tasks.mazes.rendering import level_records
 
@@ -239,8 +239,6 @@ class GridTask(Task):
             StorageError: if a file cannot be read.
         """
         if Path(name).suffix in self.suffixes:
-            if not Path(name).exists():
-                raise ValueError(f"--levels {name}: there is no such file")
             return dict(self.read_file(name)), STEPS_PER_SHORTEST
         asked = _ON_A_GRID.fullmatch(name)
         for known, kind in self._kinds.items():
@@ -251,7 +249,6 @@ class GridTask(Task):
                 levels = self.evaluation_levels(known)
             else:  # the same levels and names however it was spelt
                 size = [int(cells) for cells in asked.group(2, 3)]
-                check_size(f"--levels {name}", *size)
                 known = f"{known}@{size[0]}x{size[1]}"
                 grid = named(f"--levels {known}", self.make_distribution, kind, *size)
                 levels = grid.sample(self._levels, self.stream("levels", known))

@@ -74,22 +74,19 @@ class Level(TensorClass):
         """
         if isinstance(text, str):
             return cls._parse(text)
-        levels = [cls._parse(drawing) for drawing in text]
-        if len({level.walls.shape for level in levels}) != 1:
-            raise ValueError("from_text needs one or more drawings, all of the same size")
-        return torch.stack(levels)  # type: ignore[return-value]
+        levels: Any = torch.stack([cls._parse(drawing) for drawing in text])
+        return levels
 
     @classmethod
     def _parse(cls, drawing: str) -> Any:
         """Reads the level of one drawing."""
         rows = drawn_rows(drawing)
         flat = "".join(rows)
-        if not rows or any(len(row) != len(rows[0]) for row in rows):
-            raise ValueError(f"a level is a rectangle of characters, got\n{drawing}")
-        if set(flat) - {WALL, FREE, START, GOAL}:
-            raise ValueError(f"a level holds only '#', '.', 'S' and 'G', got\n{drawing}")
-        if flat.count(START) != 1 or flat.count(GOAL) != 1:
-            raise ValueError(f"a level has exactly one 'S' and one 'G', got\n{drawing}")
+        ends = sorted(flat.replace(WALL, "").replace(FREE, ""))
+        if len({*map(len, rows)}) != 1 or ends != sorted([START, GOAL]):
+            raise ValueError(
+                f"a level is a rectangle of '#' and '.', with one 'S' and one 'G', got\n{drawing}"
+            )
         width = len(rows[0])
         return Level(
             walls=torch.tensor([[mark == WALL for mark in row] for row in rows]),
@@ -151,29 +148,26 @@ def validate_levels(level: Level) -> None:
             an obstacle, or if they coincide, or if a direction is none; the message says which and
             how many.
     """
-    batch, walls = level.batch_size, level.walls
-    if walls.dtype != torch.bool or walls.ndim != len(batch) + 2:
-        raise ValueError(
-            f"walls must be bool [*B, H, W] with *B = {list(batch)}, "
-            f"got {walls.dtype} {list(walls.shape)}"
-        )
+    walls, direction = level.walls, getattr(level, "direction", None)
     height, width = walls.shape[-2:]
+    expected: list[tuple[str, Tensor, torch.dtype, tuple[int, ...]]]
+    expected = [("walls", walls, torch.bool, (height, width))]
+    expected += [(name, getattr(level, name), torch.int64, (2,)) for name in ("start", "goal")]
+    if direction is not None:
+        expected.append(("direction", direction, torch.int64, ()))
+    for name, entry, dtype, shape in expected:
+        if (entry.dtype, entry.shape) != (dtype, (*level.batch_size, *shape)):
+            raise ValueError(
+                f"{name} must be {dtype} {[*level.batch_size, *shape]}, "
+                f"got {entry.dtype} {list(entry.shape)}"
+            )
     limits = torch.tensor([height, width], device=walls.device)
     for name, cell in (("start", level.start), ("goal", level.goal)):
-        if cell.dtype != torch.int64 or cell.shape != (*batch, 2):
-            raise ValueError(
-                f"{name} must be int64 {[*batch, 2]}, got {cell.dtype} {list(cell.shape)}"
-            )
         _refuse_any(((cell < 0) | (cell >= limits)).any(-1), f"{name} outside {height}x{width}")
         index = cell_index(cell, width).unsqueeze(-1)
         _refuse_any(walls.flatten(-2).gather(-1, index), f"{name} on an obstacle")
     _refuse_any((level.start == level.goal).all(-1), "start and goal on the same cell")
-    if (direction := getattr(level, "direction", None)) is not None:
-        if direction.dtype != torch.int64 or direction.shape != batch:
-            raise ValueError(
-                f"direction must be int64 {list(batch)}, "
-                f"got {direction.dtype} {list(direction.shape)}"
-            )
+    if direction is not None:
         _refuse_any((direction < 0) | (direction > 3), "direction outside 0..3")
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from proposer_rl.models import own_state, population
+from proposer_rl.models import check_torch_defaults, population
 from proposer_rl.settings import signed
 from proposer_rl.tasks.mazes.levels import (
     MOVES,
@@ -45,17 +45,13 @@ class LevelEnv(EnvBase):
     Attributes:
         success_rule: What of a step is a success, as ``success`` of
             :class:`~proposer_rl.teaching.LevelTransform`.
-
-    Raises:
-        ValueError: If ``max_steps`` is less than 1.
     """
 
     success_rule = "terminated"
     _constant: Sequence[str] = ()  # observations that stay the same throughout an episode
 
     def __init__(self, levels: Level, max_steps: int) -> None:
-        if max_steps < 1:
-            raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+        check_torch_defaults()
         super().__init__(
             device=levels.walls.device,
             batch_size=levels.batch_size,
@@ -231,9 +227,6 @@ class MazeEnv(LevelEnv):
         step_penalty: Cost of a step.
         observe_agent: Whether the planes show the agent.
 
-    Raises:
-        ValueError: If ``max_steps`` is less than 1.
-
     Example:
         >>> from proposer_rl import Level
         >>> env = MazeEnv(Level.from_text("S.G"))
@@ -244,7 +237,6 @@ class MazeEnv(LevelEnv):
         (tensor([0.9900]), tensor([True]))
     """
 
-    @own_state()
     def __init__(
         self,
         levels: Level,
@@ -270,12 +262,7 @@ class MazeEnv(LevelEnv):
         Returns:
             uint8 ``[*B, H', W', 3]``; or text (a list of texts for a batch) in which ``A`` is the
             agent.
-
-        Raises:
-            ValueError: If the mode is another.
         """
-        if mode not in ("rgb_array", "ansi"):
-            raise ValueError(f"mode must be 'rgb_array' or 'ansi', got {mode!r}")
         levels, agents = self._levels.reshape(-1), self._agent.reshape(-1, 2)
         if mode == "ansi":
             places = cell_index(agents, self._grid[1] + 1).tolist()  # a line ends by a character

@@ -117,45 +117,18 @@ def faster_precision(channels: Sequence[int], device: torch.device) -> str:
     return "bf16" if in_hardware and channels[0] >= 64 else "fp32"
 
 
-def check_network(maze: MazeSettings, network: UNetSettings) -> None:
-    """Refuses a grid that the U-Net of the settings cannot see."""
-    size, channels = f"{maze.height}x{maze.width}", network.channels
-    if min(maze.height, maze.width) >> (len(channels) - 1) < 1:
-        raise ValueError(
-            f"network.channels={channels} halve a {size} maze to nothing; give fewer channels or a "
-            "larger maze"
-        )
-    if any(width % network.groups for width in channels):
-        raise ValueError(
-            f"network.channels={channels} must be multiples of network.groups={network.groups}"
-        )
-    if _normalises_single_numbers(maze.height, maze.width, network):
-        raise ValueError(
-            f"network.channels={channels} leave a group of channels with a single number on a "
-            f"{size} maze: give more channels, a larger maze or fewer than "
-            f"network.groups={network.groups}"
-        )
+def check_grid(what: str, size: Sequence[int], network: UNetSettings) -> None:
+    """Refuses a grid that the U-Net of the settings halves to nothing, or to single numbers.
 
-
-def check_level_size(name: str, size: Sequence[int], network: UNetSettings) -> None:
-    """Refuses a level of a size that the U-Net of the settings cannot see."""
-    least = 2 ** (len(network.channels) - 1)
+    Of those GroupNorm makes zeros.
+    """
     height, width = size
-    if min(height, width) < least:
-        raise ValueError(
-            f"level {name!r}: its {height}x{width} cells are halved to nothing by this "
-            f"Solver; it sees levels of {least}x{least} cells and more"
-        )
-    if _normalises_single_numbers(height, width, network):
-        raise ValueError(
-            f"level {name!r}: of its {height}x{width} cells a single number is left to this "
-            "Solver in a group of channels; give a larger one"
-        )
-
-
-def _normalises_single_numbers(height: int, width: int, network: UNetSettings) -> bool:
-    """Returns whether a group of channels has one number, which normalising makes zero."""
-    return any(
-        (height >> halvings) * (width >> halvings) * channels == network.groups
+    if any(
+        (height >> halvings) * (width >> halvings) * channels <= network.groups
         for halvings, channels in enumerate(network.channels)
-    )
+    ):
+        raise ValueError(
+            f"{what}: {height}x{width} cells are too few for this Solver: with "
+            f"network.channels={network.channels} and network.groups={network.groups} a group of "
+            "channels is left with one number or none"
+        )

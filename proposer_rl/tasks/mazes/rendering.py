@@ -44,15 +44,7 @@ def draw_level(
     Returns:
         uint8 ``[H * cell + 1, W * cell + 1, 3]`` on the CPU, with lines one pixel wide between
         cells.
-
-    Raises:
-        ValueError: If the level is batched or the cells are too small.
     """
-    if level.batch_dims or cell < 4:
-        raise ValueError(
-            f"draw_level takes one level and cells of 4 pixels or more, got batch shape "
-            f"{list(level.batch_size)} and {cell}"
-        )
     walls = level.walls.cpu()
     height, width = walls.shape
     colours = torch.tensor([FREE_COLOUR, WALL_COLOUR], dtype=torch.uint8)[walls.long()]

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
@@ -21,7 +18,6 @@ from proposer_rl.tasks.mazes.evaluation import (
     ExactEvaluator,
     RolloutEvaluator,
     optimal_return,
-    policy_path,
     worst_mean,
 )
 from proposer_rl.tasks.mazes.grid_task import GridTask
@@ -37,12 +33,11 @@ from proposer_rl.tasks.mazes.maze_settings import (
     MazeSettings,
     SpaceSettings,
     UNetSettings,
-    check_level_size,
-    check_network,
+    check_grid,
     faster_precision,
     unet,
 )
-from proposer_rl.tasks.mazes.rendering import EPISODE, draw_level
+from proposer_rl.tasks.mazes.rendering import EPISODE
 
 WORST = 0.1  # of the levels, in <name>_success_worst10
 CELLS_AT_ONCE = 2**17  # that go through the network together
@@ -86,7 +81,7 @@ class MazeTask(GridTask):
         make_network: Callable[[], nn.Module] | None = None,
     ) -> None:
         if make_network is None:
-            check_network(maze, network)
+            check_grid("maze", (maze.height, maze.width), network)
             if context.precision == "auto":
                 precision = faster_precision(network.channels, torch.device(context.device))
                 context = context._replace(precision=precision)
@@ -216,7 +211,7 @@ class MazeTask(GridTask):
     def check_level(self, name: str, level: Level) -> None:
         """Refuses a level that the U-Net cannot see; of other networks it is not known."""
         if self._make_network is None:
-            check_level_size(name, level.walls.shape, self._network)
+            check_grid(f"level {name!r}", level.walls.shape, self._network)
 
     def at_once(self, cells: int) -> int:
         """Returns how many levels of so many cells are evaluated together."""
@@ -237,19 +232,10 @@ class MazeTask(GridTask):
         """
         copies, logits = _with_logits(agent, levels)
         performance = self._exactly(copies, logits, max_steps)
-        paths = policy_path(copies, logits, max_steps)  # [K, n, max_steps + 1, 2]
         for k in range(len(copies)):
             for i, (name, known) in enumerate(about.items()):
                 results = {key: float(value[k, i]) for key, value in performance.items()}
-                away = (paths[k, i] != levels[i].goal).any(-1)
-                path = paths[k, i, : int(away.sum()) + 1].tolist()  # the goal is not left again
-                moves = f"greedy {len(path) - 1}" if results["greedy_success"] else "greedy fails"
-                note = f"shortest {known[self.steps_name]}, {moves}"
-                yield LevelResult(name, k, known, results, note, partial(_picture, levels[i], path))
-
-
-def _picture(level: Level, path: list[list[int]]) -> NDArray[np.uint8]:
-    return draw_level(level, path).numpy()
+                yield LevelResult(name, k, known, results)
 
 
 def _with_logits(agent: ActorCritic, levels: Level) -> tuple[Level, Tensor]:

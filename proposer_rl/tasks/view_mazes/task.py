@@ -6,11 +6,9 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Annotated
 
-import numpy as np
 import scipy
 import torch
 from annotated_types import Ge, Le, Len
-from numpy.typing import NDArray
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -22,7 +20,6 @@ from proposer_rl.task import ComputeContext, LevelResult, for_copies
 from proposer_rl.tasks.mazes.grid_task import GridTask
 from proposer_rl.tasks.mazes.levels import planes
 from proposer_rl.tasks.mazes.maze_settings import Channels
-from proposer_rl.tasks.mazes.rendering import draw_level
 from proposer_rl.tasks.view_mazes import view_env
 from proposer_rl.tasks.view_mazes.board import ViewBoard
 from proposer_rl.tasks.view_mazes.view_distributions import (
@@ -191,16 +188,4 @@ class ViewMazeTask(GridTask):
                     "success_high": float(interval.high),
                     "return": float(performance["return"][k, i]),
                 }
-                fewest = f"fewest actions {known[self.steps_name]}"
-                note = f"{reached} of {episodes} episodes, {fewest}"
-                picture = partial(self._picture, agent, k, levels[i], max_steps)
-                yield LevelResult(name, k, known, results, note, picture)
-
-    def _picture(
-        self, agent: ActorCritic, solver: int, level: ViewLevel, max_steps: int
-    ) -> NDArray[np.uint8]:
-        """Draws a level, and one episode of one Solver there."""
-        noise = torch.rand(max_steps, 1, generator=self._draws.generator("picture"))
-        went, steps = view_env.walks(agent, level.unsqueeze(0), max_steps, noise.to(self.device))
-        path = went[solver, 0, : int(steps[solver, 0]) + 1, :2]
-        return draw_level(level, path).numpy()
+                yield LevelResult(name, k, known, results)

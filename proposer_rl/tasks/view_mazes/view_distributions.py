@@ -84,8 +84,6 @@ class ViewDistribution:
         self, settings: ViewDistributionSettings, height: int, width: int, device: torch.device
     ) -> None:
         if isinstance(settings, ScatteredSettings):
-            if settings.fewest > settings.most:
-                raise ValueError(f"fewest={settings.fewest} must be at most most={settings.most}")
             _check_walls(settings.most, height, width)
         self._settings, self._grid, self._device = settings, (height, width), device
         self.sample(1, torch.Generator().manual_seed(0))

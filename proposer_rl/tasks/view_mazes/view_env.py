@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 from torchrl.data import Binary, Bounded, Categorical
 
 from proposer_rl.learning import play_episodes
-from proposer_rl.models import ActorCritic, MemoryNetwork, own_state
+from proposer_rl.models import ActorCritic, MemoryNetwork
 from proposer_rl.settings import settings, signed
 from proposer_rl.tasks.mazes.levels import STEPS_BETWEEN_CHECKS, cell_index, cell_plane
 from proposer_rl.tasks.mazes.maze_env import LevelEnv
@@ -69,7 +69,6 @@ class ViewMazeEnv(LevelEnv):
         (tensor([0.9892]), tensor([True]))
     """
 
-    @own_state()
     def __init__(self, levels: ViewLevel, *, max_steps: int = 250) -> None:
         super().__init__(levels, max_steps)
         batch = self.batch_size

@@ -13,7 +13,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings
 from tests.host_reads import NoHostReads
 from tests.same_run import assert_same_run
-from tests.tasks.batched_envs.toys import STILL, TOY, WIDE, windy_task
+from tests.tasks.batched_envs.toys import STILL, TOY, windy_task
 from tests.tasks.gymnasium.toys import GATE
 
 WIND = "+task.parameters.wind={low: 0.0, high: 2.0, bins: 4, target: 0.5}"
@@ -68,13 +68,10 @@ def test_its_title_target_and_levels_are_told() -> None:
 @pytest.mark.parametrize(
     ("word", "said"),
     [
-        ("task.env=nowhere.at.All", "task.env='nowhere.at.All': cannot be imported"),
-        ("task.env=Windy", "task.env='Windy': cannot be imported"),
+        ("task.env=nowhere.at.All", "env: 'nowhere.at.All': cannot be imported"),
         ("task.env=tests.tasks.batched_envs.toys.Nobody", "cannot be imported: module"),
         ("task.env=torch.nn.Linear", "task.env='torch.nn.Linear': must be a subclass of Batched"),
         ("task.env=tests.tasks.batched_envs.toys.windy_task", "must be a subclass of BatchedEnv"),
-        (f"task.env={STILL}", f"task.parameters=['wind']: {STILL} reads 'first', too"),
-        (f"task.env={WIDE}", f"task.env={WIDE}: observation_size=3, but a step makes [2]"),
         ("task.max_steps=0", "task.max_steps=0: "),
         ("task.parameters.wind.low=3", "task.parameters.wind: low=3"),
         ("task.parameters.wind.target=[1, 2, 3]", "task.parameters.wind: target="),

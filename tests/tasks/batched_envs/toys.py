@@ -14,9 +14,8 @@ from proposer_rl.tasks.batched_envs.task import BatchedTask
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings
 from proposer_rl.tasks.ranges import RangeSettings
 
-TOY = "tests.tasks.batched_envs.toys.WindyEnv"
 STILL = "tests.tasks.batched_envs.toys.StillEnv"
-WIDE = "tests.tasks.batched_envs.toys.WideEnv"
+TOY = "tests.tasks.batched_envs.toys.WindyEnv"
 
 
 class WindyEnv(BatchedEnv):
@@ -36,12 +35,6 @@ class WindyEnv(BatchedEnv):
 
     def observe(self, state: Tensor, level: Values) -> Tensor:
         return torch.stack([state.squeeze(-1), level["wind"]], -1)
-
-
-class WideEnv(WindyEnv):
-    """Says that it shows more than it does."""
-
-    observation_size = 3
 
 
 class StillEnv(BatchedEnv):

@@ -73,14 +73,6 @@ class PassesOn(Line):
         return getattr(self.inner, name)
 
 
-class Unlike(gym.Wrapper[Any, Any, Any, Any]):
-    """Shows one number more than the space that it says."""
-
-    def reset(self, **given: Any) -> Any:
-        seen, info = self.env.reset(**given)
-        return np.append(seen, 0), info
-
-
 class Grey(Line):
     """Bytes without channels."""
 
@@ -141,5 +133,23 @@ class Robot(Line):
         return super().step(int(action[0][0] > 1))
 
 
-for _name, _made in {"PassesOn": PassesOn, "Grey": Grey, "Mixed": Mixed, "Robot": Robot}.items():
+class Truck(Line):
+    """A dictionary in a dictionary is seen; two choices are made, of which the reward tells."""
+
+    observation_space = spaces.Dict(
+        place=spaces.Box(-20, 20, (2,), np.float32),
+        deep=spaces.Dict(count=spaces.Discrete(LIMIT + 1)),
+    )
+    action_space = spaces.MultiDiscrete([2, 3])
+
+    def seen(self) -> Any:
+        return {"place": super().seen(), "deep": {"count": self.t}}
+
+    def step(self, action: Any) -> Any:
+        seen, _, *rest = super().step(action[0])
+        return seen, action[1] + 0.1 * self.x, *rest
+
+
+_MADE = {"PassesOn": PassesOn, "Grey": Grey, "Mixed": Mixed, "Robot": Robot, "Truck": Truck}
+for _name, _made in _MADE.items():
     gym.register(f"{_name}-v0", _made, max_episode_steps=LIMIT)

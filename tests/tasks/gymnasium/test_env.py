@@ -145,17 +145,14 @@ def test_a_return_is_reached_up_to_rounding(reward: Any) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"kind": "return"}, "success.least: missing"),
-        ({"kind": "info"}, "success.key: missing"),
-        ({"kind": "survived", "least": 1.0}, "success.least: has no effect"),
-        ({"kind": "return", "least": 1.0, "key": "a"}, "success.key: has no effect"),
-        ({"kind": "survived", "optional": True}, "success.optional: has no effect"),
-        ({"kind": "return", "least": 1.0, "once": True}, "success.once: has no effect"),
+        ({"kind": "return"}, "least: missing"),
+        ({"kind": "info"}, "key: missing"),
+        ({"kind": "survived", "least": 1.0}, "least: has no effect"),
     ],
 )
 def test_success_has_what_its_kind_needs(settings: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        SuccessSettings(**settings).check()
+        SuccessSettings(**settings)
 
 
 RULES = [

@@ -56,11 +56,6 @@ def test_the_most_probable_actions_give_what_a_loop_gives() -> None:
     assert 0 < found["success"].mean() < 1
 
 
-def test_more_episodes_of_the_most_probable_actions_are_refused_as_they_would_be_the_same() -> None:
-    with pytest.raises(ValueError, match="episodes=2: with actions=most_probable"):
-        EvaluationSettings(levels=4, episodes=2, actions="most_probable")
-
-
 def test_drawn_actions_give_the_same_distribution() -> None:
     episodes = 150
     task = walk_task(evaluation=EvaluationSettings(levels=4, episodes=episodes))

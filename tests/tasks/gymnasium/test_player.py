@@ -9,12 +9,12 @@ import gymnasium
 import numpy as np
 import pytest
 
+from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.player import (
     LevelPlayer,
     MakeEnvironment,
     ParameterSettings,
     Play,
-    RefusedLevelError,
     imported,
 )
 from tests.tasks.gymnasium.toys import LIMIT, NO_BOX2D, PARAMETERS, WALK
@@ -189,7 +189,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("parameters", "value", "message"), REFUSED)
 def test_what_the_environment_refuses_is_told(parameters: Any, value: int, message: str) -> None:
-    with pytest.raises(RefusedLevelError, match=message):
+    with pytest.raises(UnfitEnvironmentError, match=message):
         player = LevelPlayer(
             MakeEnvironment(WALK), parameters, Play(dict.fromkeys(parameters, value), 0)
         )

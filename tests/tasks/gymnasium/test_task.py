@@ -22,7 +22,6 @@ from proposer_rl.runs.folder import read_csv
 from proposer_rl.runs.records import TaskFacts, checked
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium import batched_env, pictures
-from proposer_rl.tasks.gymnasium.networks import NetworkSettings
 from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, ParameterSettings, Play
 from tests.tasks.gymnasium.odd import Line, odd
 from tests.tasks.gymnasium.toys import NO_BOX2D, PARAMETERS, TINY, WALK, Walk, walk_task
@@ -53,24 +52,22 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     (one(), "parameters.a: Walk has no attribute 'a'; numbers that it has: width, wind"),
     ({"parameters": {"width": NEGATIVE}},
      r"parameters: .*Walk-v0 refuses width=-1, seed=\d+: ValueError: width must .*\(toys"),
-    (one(set="call", name="nowhere.f"), "parameters.a.name: 'nowhere.f': cannot be imported"),
-    (one(set="call"), "parameters.a.name: missing"),
+    (one(set="call", name="nowhere.f"), "parameters: .*ValueError: 'nowhere.f': cannot be"),
+    (one(set="call"), "parameters: .*ValueError: 'a': cannot be imported"),
     ({"wrappers": [f"{HERE}.with_whole_actions"]},
      r"action space Box.*int64\): there is a policy for .* a Box of floats"),
-    ({"env_id": "tests.tasks.gymnasium.broken:Walk-v0"},
-     r"env_id=.*: its module cannot be imported: ZeroDiv.* \(broken.py, line \d+\)$"),
+    ({"env_id": "tests.tasks.gymnasium.broken:Walk-v0", "parameters": {}},
+     r"env_id=.*: it cannot be made: ZeroDiv.* \(broken.py, line \d+\)$"),
     ({"parameters": {n: ParameterSettings(name="wind", values=[1], target=1) for n in "ab"}},
      "parameters.b: wind is set by parameters.a, too"),
     ({"parameters": {"a,b": PARAMETERS["width"]}}, "parameters.a,b: must be a name of letters"),
-    ({"wrappers": ["nowhere.Wrapper"]}, "wrappers: 'nowhere.Wrapper': cannot be imported"),
+    ({"wrappers": ["nowhere.Wrapper"]}, "wrappers: nowhere.Wrapper: .*cannot be imported"),
     ({"arguments": {"foo": 1}}, "parameters: .*refuses .*unexpected keyword"),
     ({"arguments": {"foo": 1}, "parameters": {}},
      "env_id=.*: it cannot be made: TypeError: .*unexpected keyword"),
     ({"env_id": f"{HERE}:Grown-v0", "parameters": {"size": SIZES}},
      "parameters.size: all levels must show and take the same, but 5 changes"),
     ({"env_id": f"{HERE}:Endless-v0"}, "max_steps: missing"),
-    ({"network": NetworkSettings(hidden=[8], channels=[4])},
-     r"network.channels=\[4\]: has no effect where no image is seen"),
 ]  # fmt: skip
 
 

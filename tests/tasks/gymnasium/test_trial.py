@@ -16,16 +16,11 @@ from tensordict import TensorDict
 from torchrl.envs import (
     CatFrames,
     Compose,
-    EndOfLifeTransform,
-    ExcludeTransform,
     FrameSkipTransform,
-    InitTracker,
-    NoopResetEnv,
     ObservationNorm,
     RewardClipping,
     RewardScaling,
     RewardSum,
-    SelectTransform,
     StepCounter,
     UnaryTransform,
     VecNorm,
@@ -45,7 +40,6 @@ from proposer_rl.tasks.gymnasium.player import (
     MakeEnvironment,
     ParameterSettings,
     Play,
-    WrapperError,
 )
 from tests.tasks.gymnasium.odd import LIMIT, Line, Robot, odd, with_parts
 from tests.tasks.gymnasium.toys import walk_task
@@ -80,37 +74,24 @@ def sets_back(self: Line) -> None:
 FLOATS = spaces.Box(-np.inf, np.inf, (2,), np.float64)
 BYTES, PAIR = spaces.Box(0, 255, (2,), np.uint8), (spaces.Discrete(2), spaces.Box(0, 1, (1,)))
 MISREAD: list[tuple[dict[str, Any], str]] = [
-    ({"reset": lambda self, **o: Line.reset(self, **o)[0]}, "reset must return two values"),
-    ({"reset": lambda self, **o: (*Line.reset(self, **o), 1)}, "reset must return two values"),
-    ({"reset": lambda self: (None, {})}, "reset must take the arguments seed and options"),
-    ({"step": lambda self, a: (*Line.step(self, a)[:3], {})},
-     "step must return five values, .* a tuple of 4: ndarray, float, bool, dict"),
+    # The reset's only array of two, and a step of old Gym's.
+    ({"reset": lambda self, **o: Line.reset(self, **o)[0]}, "env_id=Odd.*float32 .*space is Box"),
+    ({"step": lambda self, a: (*Line.step(self, a)[:3], {})}, "env_id=Odd.*step raises ValueError"),
     (steps(None), "the reward must be a number, not None"),
-    (steps("1.0"), "the reward must be a number, not '1.0'"),
     (steps(np.zeros(2)), "the reward must be a number, not array"),
     (steps(np.nan), "a reward of nan: it must be finite"),
-    (steps(-np.inf), "a reward of -inf: it must be finite"),
     (steps(1e300), "a reward of 1e.300: it must be finite, also as float32"),
     ({"step": lambda self, a: 1 / 0}, r"env_id=Odd.*step raises ZeroDivisionError: .*"
      r"\(test_trial.py, line \d+\), on the level goal=3, seed=\d+"),
-    (steps(0.0, "no"), "terminated must be true or false, not 'no'"),
-    (shows(np.zeros(3, np.float32)), r"reset shows an observation of shape \[3\] instead of \[2\]"),
-    (shows(np.array([np.nan, 0.0])), "reset shows NaN or infinity"),
+    (steps(0.0, 2), "terminated must be true or false, not 2"),
+    (shows(np.array([np.nan, 0.0])), "it shows NaN or infinity"),
     (shows(np.array([1e300, 0.0]), FLOATS), "shows NaN or infinity, or a number beyond float32"),
-    (shows(["a", "b"]), "which are no numbers"),
-    (shows(None), "shape"),
-    (shows(np.array([0.3, 0.7]), BYTES), r"\[0.3 0.7\] of float64, which uint8 cannot hold"),
-    (shows(3, spaces.Discrete(3)), "reset shows 3; its observation space is Discrete"),
-    (shows({"b": 1}, spaces.Dict({"a": spaces.Discrete(3)})), "instead of the entries a"),
+    (shows({"b": 1}, spaces.Dict({"a": spaces.Discrete(3)})), "refuses goal=3, .*KeyError: 'a'"),
     (shows({"a": "abc"}, spaces.Dict({"a": spaces.Text(3)})),
      "no network for Text.*its part a; .*FilterObservation"),
-    (shows((1,), spaces.Sequence(spaces.Discrete(2))),
-     "env_id=Odd.*no network for Sequence.*; a wrapper can make numbers of it"),
-    ({"action_space": spaces.Text(3)}, "action space Text.*there is a policy for"),
     ({"action_space": spaces.Tuple(PAIR)}, "action space Tuple.*there is a policy for"),
     (steps(info={"is_success": "False"}), "success.key=is_success.*not 'False'"),
     (steps(info={"is_success": 0.3}), "success.key=is_success.*not 0.3"),
-    (steps(info={"is_success": [True, False]}), "success.key=is_success.*not .True, False"),
     (steps(info={"is_sucess": True, "a": {"b": 1}}), "it has: is_sucess, a, a.b; "),
     ({"metadata": None}, "env_id=Odd"),
     ({"goal": property(lambda self: 3.0)}, "parameters.goal: goal of Odd cannot be set to"),
@@ -121,7 +102,7 @@ MISREAD: list[tuple[dict[str, Any], str]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.filterwarnings("ignore")  # Gymnasium's own checker
+@pytest.mark.filterwarnings("ignore")  # of check_env
 @pytest.mark.parametrize(("members", "message"), MISREAD)
 def test_what_would_be_misread_is_refused(members: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
@@ -239,7 +220,6 @@ def test_what_is_only_passed_on_is_not_set_beside_it() -> None:
     [
         ("gymnasium.wrappers.NormalizeObservation", "it keeps running statistics"),
         ("gymnasium.wrappers.NormalizeReward", "it keeps running statistics"),
-        ("tests.tasks.gymnasium.odd.Unlike", r".*shape \[3\] instead of \[2\]"),
         ("gymnasium.wrappers.FilterObservation", "TypeError: .*filter_keys"),
     ],
 )
@@ -271,7 +251,6 @@ def hill(colour: int) -> dict[str, Any]:
 HILL = {"hill": ParameterSettings(values=[1.0, 3.0], target=3.0)}
 FRACTIONS = {"goal": ParameterSettings(low=1.0, high=3.0, target=3.0)}
 MASKED = spaces.Dict({"x": spaces.Box(0, 1, (1,)), "action_mask": spaces.MultiBinary(2)})
-WIDE = spaces.Box(0, 2**30, (2,), np.int64)
 MASK = {"x": np.zeros(1, np.float32), "action_mask": np.ones(2, np.int8)}
 NOISE = {"seen": lambda self: np.array([np.random.normal(), self.goal], np.float32)}
 IGNORED = {"typo": ParameterSettings(set="option", values=[0, 1], target=0)}
@@ -285,9 +264,8 @@ DOUBTED: list[tuple[Any, Any, str | None]] = [
     ({}, FRACTIONS, None),
     ({"goal": 3}, WHOLE, None),
     (shows(MASK, MASKED), GOAL, "action_mask: .* actions are not masked"),
-    (shows(np.zeros(2, np.int64), WIDE), GOAL,
-     "observation: whole numbers up to 1,073,741,824 lose digits beyond 16,777,216"),
-    (NOISE, GOAL, "the reset's seed does not decide all of it"),
+    (NOISE, GOAL, "check_env: .* is non-deterministic"),
+    ({"reset": lambda self, seed=None, options=None: Line.reset(self)}, GOAL, "check_env: "),
 ]  # fmt: skip
 
 
@@ -316,27 +294,21 @@ def test_a_time_limit_of_its_own_is_the_time_limit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("members", "least", "said"),
+    ("members", "least", "told"),
     [
-        ({"reward_range": (0.0, 1.0)}, LIMIT + 1, "error"),
-        ({"reward_range": (0.0, 1.0)}, LIMIT, None),
-        ({"reward_range": (-9.0, -1.0)}, -1, None),
-        ({"reward_range": (-9.0, -1.0)}, 0, "error"),
-        (steps(2.0), 2 * LIMIT + 1, "warning"),
-        (steps(2.0), 2 * LIMIT, None),
-        ({}, 1000, None),  # what reaching the goal pays is not seen in an episode that does not
+        (steps(2.0), 2 * LIMIT + 1, True),
+        (steps(2.0), 2 * LIMIT, False),
+        (steps(-1.0), 0, False),
+        ({}, 1000, False),  # what reaching the goal pays is not seen in an episode that does not
     ],
 )
-def test_a_return_that_is_never_reached_is_told(members: Any, least: float, said: Any) -> None:
-    pays = members.get("reward_range", (0, 0))[0]
-    step = steps(pays) if pays else {}
+def test_a_return_that_is_never_reached_is_told(members: Any, least: float, told: bool) -> None:
     rule = SuccessSettings(kind="return", least=least)
-    refused = pytest.raises(ValueError, match=f"success.least={least}: is never reached")
-    with warnings.catch_warnings(), refused if said == "error" else nullcontext():
+    with warnings.catch_warnings():
         warnings.simplefilter("error")
         warned = pytest.warns(UserWarning, match=f"success.least={least}: can it be reached?")
-        with warned if said == "warning" else nullcontext():
-            line_task(odd(**{**step, **members}), success=rule)
+        with warned if told else nullcontext():
+            line_task(odd(**members), success=rule)
 
 
 SMALL = spaces.Box(-9, 9, (2,), np.int32)
@@ -367,29 +339,31 @@ def test_whole_numbers_of_another_type_are_seen_as_they_are(space: Any, seen: An
 
 CHOICE, CHOICES, BITS = spaces.Discrete(5), spaces.MultiDiscrete([5, 5]), spaces.MultiBinary(2)
 BOXED = spaces.Dict({"a": spaces.Box(-1, 1, (2,)), "b": CHOICE})
-LATER: list[tuple[Any, Any, Any, str]] = [
-    (BYTES, np.array([1, 2]), np.array([1, 256]), r"\[ 1 256\] of int64, which uint8 cannot"),
-    (Line.observation_space, np.ones(2), np.ones(3), r"shape \[3\] instead of \[2\]"),
-    (Line.observation_space, np.ones(2), None, r"shape \[\] instead of \[2\]"),
-    (Line.observation_space, np.ones(2), ["a", "b"], "which are no numbers"),
-    (CHOICE, 1, -1, r"shows -1; its observation space is Discrete\(5\)"),
-    (CHOICES, np.array([1, 2]), np.array([1, -2]), r"shows \[ 1 -2\]; its"),
-    (BITS, np.array([0, 1]), np.array([0, 2]), r"shows \[0 2\]; its"),
-    (BITS, np.array([0, 1]), np.array([0, 256]), "which int8 cannot hold"),
-    (BOXED, {"a": np.ones(2), "b": 1}, {"a": np.ones(3), "b": 1}, r"shape \[3\] instead of \[2\]"),
+LATER: list[tuple[Any, Any, Any]] = [
+    (BYTES, np.array([1, 2]), np.array([1, 256])),
+    (BYTES, np.array([1, 2]), np.array([0.3, 0.7])),
+    (Line.observation_space, np.ones(2), np.ones(3)),
+    (Line.observation_space, np.ones(2), None),
+    (Line.observation_space, np.ones(2), ["a", "b"]),
+    (CHOICE, 1, -1),
+    (CHOICE, 1, 5),
+    (CHOICES, np.array([1, 2]), np.array([1, -2])),
+    (BITS, np.array([0, 1]), np.array([0, 2])),
+    (BITS, np.array([0, 1]), np.array([0, 256])),
+    (BOXED, {"a": np.ones(2), "b": 1}, {"a": np.ones(3), "b": 1}),
 ]
 
 
-@pytest.mark.parametrize(("space", "first", "later", "message"), LATER)
+@pytest.mark.parametrize(("space", "first", "later"), LATER)
 def test_what_a_space_cannot_hold_is_also_refused_after_the_trial(
-    space: Any, first: Any, later: Any, message: str
+    space: Any, first: Any, later: Any
 ) -> None:
-    shown = odd(**shows(first, space))
-    player = LevelPlayer(MakeEnvironment(shown), GOAL, Play({"goal": 3.0}, 0))
+    player = LevelPlayer(MakeEnvironment(odd(**shows(first, space))), GOAL, Play({"goal": 3.0}, 0))
     player.reset()
     player.unwrapped.seen = lambda: later  # type: ignore[attr-defined]
+    message = r"the environment shows .*; its observation space is .*, on the level goal=3, seed=0"
     for act in (player.reset, lambda: player.step(0)):
-        with pytest.raises(UnfitEnvironmentError, match=f"{message}.*, on the level goal=3, seed"):
+        with pytest.raises(UnfitEnvironmentError, match=message):
             act()
 
 
@@ -449,7 +423,7 @@ def test_a_wrapper_that_fails_after_the_trial_is_blamed(vectorization: Any) -> N
     )  # fmt: skip
     level = TensorDict({"goal": torch.tensor([[2.0]]), "seed": torch.tensor([[7]])}, [1, 1])
     with pytest.raises(
-        WrapperError, match=r"wrappers: .*that_fits_the_ends: RuntimeError: it fits"
+        UnfitEnvironmentError, match=r"wrappers: .*that_fits_the_ends: RuntimeError: it fits"
     ):
         task.environment(level)
 
@@ -600,22 +574,13 @@ def test_evaluations_show_what_training_shows_and_pay_what_the_environment_pays(
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: "torchrl.envs.RewardScaling", "must be transforms of TorchRL"),
+        (lambda: "torchrl.envs.RewardScaling", "must be a transform of TorchRL"),
         (lambda: Compose(VecNorm(in_keys=["observation"])), "VecNorm: it keeps running statistics"),
         (lambda: VecNormV2(in_keys=["observation"]), "VecNormV2: it keeps running statistics"),
         (lambda: FrameSkipTransform(2), "FrameSkipTransform: it steps on beyond an episode's end"),
-        (lambda: StepCounter(max_steps=4), "StepCounter: max_steps=4: .* set max_steps of the"),
-        # TorchRL's does not take it that only some of a batch of two dimensions begin.
-        (lambda: CatFrames(N=3, dim=-1, in_keys=["observation"]), "RuntimeError: shape mismatch"),
-        (lambda: SelectTransform("observation"), 'KeyError: .*"success" not found'),
-        (lambda: ExcludeTransform("observation"), "ValueError: .* non-empty list"),
-        (lambda: InitTracker(), "NotImplementedError: class InitTracker"),
-        (lambda: NoopResetEnv(2), "ValueError: .* NoopResetEnv"),
-        (lambda: EndOfLifeTransform(), "IndexError"),
+        (lambda: StepCounter(max_steps=4), "StepCounter: .* max_steps: take the task's"),
     ],
 )
-def test_transforms_that_do_not_work_are_refused_before_anything_is_trained(
-    make: Any, message: str
-) -> None:
-    with pytest.raises(ValueError, match=f"transforms: {message}"):
+def test_transforms_that_would_mislead_are_refused(make: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=f"transforms: .*{message}"):
         line_task(odd(), transforms=[make()])

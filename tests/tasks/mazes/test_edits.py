@@ -135,11 +135,3 @@ def test_where_there_is_no_room_only_obstacles_change() -> None:
     assert chisquare([found.count("flip"), found.count("none")], [100, 200]).pvalue > 1e-3
     pair = copies_of("SG", 50)
     assert (edit_levels(pair, 6, generators(0)) == pair).all()
-
-
-def test_wrong_arguments_are_refused() -> None:
-    levels = random_levels(4, 3, 3, 0.2, 0).reshape(2, 2)
-    with pytest.raises(ValueError, match="count must be at least 0, got -1"):
-        edit_levels(levels, -1, generators(0, 1))
-    with pytest.raises(ValueError, match="2 generators are needed for levels of 2 replicas, got 3"):
-        edit_levels(levels, 1, generators(0, 1, 2))

@@ -124,13 +124,6 @@ def test_levels_of_another_shape_are_refused(levels: Level) -> None:
         env.set_levels(levels)
 
 
-def test_wrong_arguments_are_refused() -> None:
-    with pytest.raises(ValueError, match="max_steps must be at least 1, got 0"):
-        MazeEnv(ROOM, max_steps=0)
-    with pytest.raises(ValueError, match="'human'"):
-        MazeEnv(ROOM).render("human")
-
-
 def test_what_is_stepped_decides_where_the_agent_is() -> None:
     """A step is a function of the tensordict, so any state can be returned to."""
     env = MazeEnv(ROOM)

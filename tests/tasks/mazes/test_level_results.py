@@ -14,7 +14,6 @@ from proposer_rl.tasks.mazes import Level, planes
 from proposer_rl.tasks.mazes.evaluation import RolloutEvaluator
 from proposer_rl.tasks.mazes.level_files import levels_from_text
 from proposer_rl.tasks.mazes.maze_settings import MazeSettings
-from proposer_rl.tasks.mazes.rendering import draw_level
 from tests.tasks.mazes.oracles import random_levels
 from tests.tiny import tiny_task
 
@@ -73,7 +72,6 @@ def test_policies_whose_scores_are_known() -> None:
     about = ("height", "width", "path_length")
     assert [tuple(s.about[key] for key in about) for s in scores[::2]] == sizes
     solved = {("right", 0): 4, ("down", 1): 2, ("right too", 0): 2}
-    levels = levels_from_text(HALLS)
     for s in scores:
         moves, length = solved.get((s.level, s.solver)), s.about["path_length"]
         assert s.about["max_steps"] == 2 * length
@@ -85,13 +83,6 @@ def test_policies_whose_scores_are_known() -> None:
             "return": pytest.approx(expected),
             "greedy_return": pytest.approx(expected),
         }
-        greedy = f"greedy {moves}" if moves else "greedy fails"
-        assert s.note == f"shortest {length}, {greedy}"
-        assert s.picture().shape == draw_level(levels[s.level]).shape
-    paths = {0: [[0, 0], [0, 1], [0, 2], [0, 3], [0, 4]], 7: [[0, 0], *[[1, 0]] * 6]}
-    for number, path in paths.items():
-        expected = draw_level(levels[scores[number].level], path).numpy()
-        assert (scores[number].picture() == expected).all()
 
 
 def solvers(per_step: bool = False) -> ActorCritic:
@@ -110,9 +101,8 @@ def test_a_level_has_the_same_score_in_any_company() -> None:
     together = results(solver, levels, lambda length: 12)
     alone = [s for n, v in levels.items() for s in results(solver, {n: v}, lambda length: 12)]
     for one, other in zip(together, alone, strict=True):
-        assert one[:3] == other[:3] and one.note == other.note
+        assert one[:3] == other[:3]
         assert one.results == pytest.approx(other.results, abs=1e-5)
-        assert (one.picture() == other.picture()).all()
     assert len({round(s.results["success"], 6) for s in together}) > 6
 
 
@@ -122,7 +112,7 @@ def test_many_levels_go_through_the_network_in_parts(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("proposer_rl.tasks.mazes.task.CELLS_AT_ONCE", 2 * 16)
     parts = results(solvers(), levels, lambda length: 9)
     for one, other in zip(parts, whole, strict=True):
-        assert one[:3] == other[:3] and (one.picture() == other.picture()).all()
+        assert one[:3] == other[:3]
         assert one.results == pytest.approx(other.results, abs=1e-5)
 
 

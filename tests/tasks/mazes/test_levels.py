@@ -38,10 +38,8 @@ def test_text_of_two_batch_dimensions_is_nested() -> None:
     assert levels.to_text() == [[levels[i, j].to_text() for j in range(3)] for i in range(2)]
 
 
-@pytest.mark.parametrize(
-    "drawing", ["", "S.\nG", "S.", "SG\nS.", "S?G", "S . G", ["SG", "S.G"], []], ids=repr
-)
-def test_text_that_is_no_level_is_refused(drawing: str | list[str]) -> None:
+@pytest.mark.parametrize("drawing", ["", "S.\nG", "S.", "SG\nS.", "S?G", "S . G"], ids=repr)
+def test_text_that_is_no_level_is_refused(drawing: str) -> None:
     with pytest.raises(ValueError):
         Level.from_text(drawing)
 
@@ -68,10 +66,10 @@ def test_valid_levels_pass() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"walls": torch.zeros(2, 2, 3)}, "walls must be bool"),
-        ({"walls": torch.zeros(2, 3, dtype=torch.bool)}, "walls must be bool"),
-        ({"start": torch.zeros(2, 2)}, "start must be int64"),
-        ({"goal": torch.zeros(2, 3, dtype=torch.int64)}, "goal must be int64"),
+        ({"walls": torch.zeros(2, 2, 3)}, "walls must be torch.bool"),
+        ({"walls": torch.zeros(2, 3, dtype=torch.bool)}, "walls must be torch.bool"),
+        ({"start": torch.zeros(2, 2)}, "start must be torch.int64"),
+        ({"goal": torch.zeros(2, 3, dtype=torch.int64)}, "goal must be torch.int64"),
         ({"start": torch.tensor([[0, 0], [0, 3]])}, "1 of 2 levels have the start outside 2x3"),
         ({"goal": torch.tensor([[-1, 2], [1, 2]])}, "1 of 2 levels have the goal outside 2x3"),
         ({"goal": torch.tensor([[0, 2], [0, 2]])}, "2 of 2 levels have the goal on an obstacle"),

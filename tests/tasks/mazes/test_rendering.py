@@ -64,11 +64,3 @@ def test_a_triangle_points_where_the_agent_looks(mark: str, axis: int, sign: int
     widths = widths[widths > 0]
     assert len(widths) > 6 and (sign * widths.diff() <= 0).all() and white.sum() < 100
     assert widths.amax() > 4 * widths.amin()
-
-
-def test_wrong_shapes_are_refused() -> None:
-    levels = Level.from_text(["S.G", "G.S"])
-    with pytest.raises(ValueError, match=r"\[2\]"):
-        draw_level(levels)
-    with pytest.raises(ValueError, match="3"):
-        draw_level(levels[0], cell=3)

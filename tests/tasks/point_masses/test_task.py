@@ -81,7 +81,10 @@ def test_runs_resume_with_the_same_bytes(method: list[str], train: Any) -> None:
         ("task.parameters.width.low=-1.0", "parameters.width: -1 to"),
         ("task.parameters.friction.target=-0.1", "parameters.friction: -0.1 goes below zero"),
         ("+task.parameters.mass={values: [1], target: 1}", "task.parameters.mass: unknown"),
-        ("task.parameters.position.target.distribution=gauss", "='gauss': must be norm"),
+        (
+            "task.parameters.position.target.distribution=gauss",
+            "'gauss': input should be 'norm'",
+        ),
     ],
 )
 def test_what_no_mass_can_be_before_is_refused(

@@ -108,8 +108,3 @@ def test_a_goal_at_the_limit_is_reached_and_not_cut_off() -> None:
     assert rollout["terminated"].flatten().tolist() == [False, True, False, False]
     assert rollout["truncated"].flatten().tolist() == [False, False, False, True]
     assert rollout["reward"].flatten().tolist() == pytest.approx([0.0, 0.1, 0.0, 0.0])
-
-
-def test_a_step_limit_is_positive() -> None:
-    with pytest.raises(ValueError, match="max_steps must be at least 1, got 0"):
-        ViewMazeEnv(random_levels(1), max_steps=0)

@@ -83,7 +83,7 @@ def test_directions_are_checked() -> None:
     for wrong in (torch.tensor([0, 4, 1]), torch.tensor([0, -1, 1])):
         with pytest.raises(ValueError, match="1 of 3 levels have the direction outside"):
             validate_levels(levels.replace(direction=wrong))
-    with pytest.raises(ValueError, match="direction must be int64"):
+    with pytest.raises(ValueError, match="direction must be"):
         validate_levels(levels.replace(direction=torch.zeros(3)))
 
 
@@ -203,7 +203,6 @@ def test_without_lengths_a_goal_may_be_out_of_reach() -> None:
     [
         (lambda: ViewDistribution(PerfectSettings(), 4, 5, CPU), "odd sides, got 4x5"),
         (lambda: ViewDistribution(RoomsSettings(), 2, 5, CPU), "at least 3x3 cells, got 2x5"),
-        (lambda: ViewDistribution(ScatteredSettings(fewest=9, most=8), 5, 5, CPU), "fewest=9"),
         (lambda: ViewDistribution(ScatteredSettings(most=24), 5, 5, CPU), "at most 23 walls"),
         (
             lambda: solvable(lambda n: ViewLevel.from_text([">#G"] * n), 2),
