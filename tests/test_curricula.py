@@ -246,7 +246,5 @@ def test_a_frozen_proposer_refuses_weights_of_another_network() -> None:
 
 
 def test_refuses_what_does_not_fit() -> None:
-    with pytest.raises(ValueError, match="must be a SolverTrainingEnv"):
-        ProposerTrainer(learners(1))
     with pytest.raises(ValueError, match="horizon 4 must be the meta-environment's number of"):
         ProposerTrainer(PPO(meta_env(), proposer_agent(mix=False), PPOSettings(horizon=4)))

@@ -94,15 +94,15 @@ def test_a_run_is_a_plain_loop_of_updates(plain: tuple[Experiment, dict, Path]) 
 
 def test_a_teacher_in_a_plain_loop_trains_the_same_solvers(tmp_path: Path) -> None:
     """The outer loop has no way into a curriculum that others have not."""
-    run = experiment(tmp_path, 7, 8, curriculum=MADE["plr"](), updates=8)
+    run = experiment(tmp_path, 7, curriculum=MADE["plr"](), updates=8)
     run.run()
-    solvers = learner(7, 8)
+    solvers = learner(7)
     able = TaskStudent(TASK, solvers)
-    teacher = Teacher(MADE["plr"](), TASK, seed=7, students=2, student=able)
+    teacher = Teacher(MADE["plr"](), TASK, seed=7, student=able)
     for update in range(8):
-        solvers.env.set_levels(teacher.propose(P))
-        actions = [Streams(seed, "update", update).generator("actions") for seed in (7, 8)]
-        teacher.observe(outcome_of(solvers.update(actions).rollout))
+        solvers.env.set_levels(teacher.propose(P).unsqueeze(0))
+        actions = Streams(7, "update", update).generator("actions")
+        teacher.observe(outcome_of(solvers.update([actions]).rollout))
     assert (run.learner.snapshot() == solvers.snapshot()).all()
     assert 0 < teacher.log()["replayed"] < 1
 

@@ -14,7 +14,7 @@ from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.points import Place, Points, measured
 from proposer_rl.curricula.student import Student
-from proposer_rl.settings import ArgumentError, Count, checked
+from proposer_rl.settings import Count, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Space
 
@@ -70,8 +70,6 @@ class BoundsCurriculum(Curriculum):
         measure: Measure = "success",
         rounded: bool = True,
     ) -> None:
-        if lower > upper:
-            raise ArgumentError(f"lower={lower}: must be at most upper={upper}")
         self.space, self._points = space, Points(space, rounded)
         self.reads = ("success",) if measure == "success" else ()
         self._start, self._step = self._points.at(start), step

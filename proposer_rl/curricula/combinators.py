@@ -27,12 +27,6 @@ class Combinator(LearnedCurriculum):
 
     def __init__(self, parts: Sequence[Curriculum]) -> None:
         self.parts = list(parts)
-        for part in self.parts:
-            if not isinstance(part, Curriculum):
-                raise ArgumentError(
-                    f"curriculum={part!r:.60}: must be a Curriculum; a recipe is made into one by "
-                    "Teacher(...).curriculum, or by train"
-                )
         self.needs = tuple(dict.fromkeys(need for part in parts for need in part.needs))
         self.reads = tuple(dict.fromkeys(entry for part in parts for entry in part.reads))
         self.trains_replicas = any(part.trains_replicas for part in self._learned())

@@ -52,8 +52,7 @@ class ContinuedLevels:
     def __init__(
         self, curriculum: Curriculum, student: Student, learner: PPO, like: Levels
     ) -> None:
-        if learner.collector.episodes is None:
-            raise ValueError("the learner's episodes do not go on: see continue_episodes")
+        assert learner.collector.episodes is not None  # which continue_episodes makes
         self._curriculum, self._student, self._learner = curriculum, student, learner
         self._episodes = learner.collector.episodes
         self._episodes.next_levels = self._next_levels

@@ -29,7 +29,6 @@ deviation 1 by their weights,
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -57,9 +56,6 @@ CLOSE = 1e-10  # coefficients that change no more than this are found
 EQUAL = 1e-6  # returns that differ no more than this are equal, in units of the worst one
 
 ANSWERED = ("performance", "exact_performance")
-FIRST = 128  # levels that came back first, by which it is judged what the labels say
-ALIKE = 0.95  # share of them with one label, beyond which that is nearly nothing
-WRONG = 0.1  # share of them with another success than their label, beyond which it should be read
 PARTS = 10  # of the probabilities from 0 to 1, in which what was predicted is compared
 
 
@@ -259,7 +255,6 @@ class Modelled(Combinator):
         self._inbox = Inbox()
         self._has_taken = False  # whether anything since the last proposal, as logs make it
         self._seen: list[dict[str, Tensor]] = []  # what was predicted, and what it was, [K, m]
-        self._first: list[Tensor] | None = []  # that came back, [2, K, n]; None once judged
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """Returns what the curriculum proposes, with a student whose performance is predicted."""
@@ -271,24 +266,11 @@ class Modelled(Combinator):
         return self._inbox.batch(batch.levels, features=phi, predicted=predicted, notes=batch.notes)
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Keeps the outcome for the model, and passes it on to the curriculum.
-
-        Raises:
-            ValueError: if the outcome has no success and success is what is labelled.
-        """
+        """Keeps the outcome for the model, and passes it on to the curriculum."""
         self._inbox.check(batch, outcome)
-        if self._labels == "success" and "success" not in outcome.keys():
-            raise ValueError("labels=success: the outcome has no success; above_worst needs none")
         reached = {name: outcome[name].double() for name in self._model.reads}
         self.parts[0].observe(student, Batch(batch.levels, batch.notes["notes"]), outcome)
         self._inbox.put(batch, **batch.notes.select("features", "predicted"), **reached)
-        if self._first is not None and self._labels == "above_worst":
-            self._judge(outcome)
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what ``state_dict`` returned; labels are not judged again."""
-        super().load_state_dict(state)
-        self._first = None
 
     def improve(self, student: Student, streams: Sequence[Streams]) -> dict[str, Any]:
         """Improves the curriculum, with a student whose performance the model predicts."""
@@ -305,29 +287,6 @@ class Modelled(Combinator):
         )
         self._seen = []
         return log | calibration(predicted, label)
-
-    def _judge(self, outcome: TensorDictBase) -> None:
-        """Warns where the first outcomes show that the labels say little."""
-        returns = outcome["return"].double().cpu()
-        success = outcome.get("success", torch.full_like(returns, torch.nan)).double().cpu()
-        self._first = [*(self._first or []), torch.stack([returns, success])]
-        first = torch.cat(self._first, -1)  # [2, K, m]
-        if first.shape[-1] < FIRST:
-            return
-        self._first = None
-        label = OutcomeModel(labels="above_worst").labels({"return": first[0]})
-        wrong = (first[1] - label).abs().nanmean()  # NaN where there is none
-        found = f"labels=above_worst: {float(label.mean()):.0%} of the first returns are that"
-        if wrong > WRONG:
-            warnings.warn(
-                f"{found}, and not the success that was told, which labels=success reads",
-                stacklevel=2,
-            )
-        elif wrong.isnan() and label.mean() > ALIKE:
-            warnings.warn(
-                f"{found}, so that the labels say nearly nothing; give labels=success, and tell it",
-                stacklevel=2,
-            )
 
     def _take_in(self) -> None:
         """Adds the outcomes since the last proposal to the model's data as one batch."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
@@ -17,7 +16,6 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import Levels, Space, refuse_many_bins, refuse_unfit_bins
 
 CHUNK = 2**16  # places that are compared at once
-MANY = 100_000  # bins, among which the nearest takes long
 Place = Annotated[float, Interval(ge=-1, le=1)]
 """Where a parameter lies in its range, from -1 to 1."""
 
@@ -34,15 +32,10 @@ class Points:
         size: the number D of coordinates.
 
     Raises:
-        ValueError: if the space has a single bin or too many, or no levels at points where these
-            are asked for.
+        ValueError: if the space has a single bin or too many.
     """
 
     def __init__(self, space: Space, rounded: bool) -> None:
-        if not rounded and not hasattr(space, "at"):
-            raise ArgumentError(
-                f"rounded=false: {type(space).__name__} has bins alone; leave rounded=true"
-            )
         if rounded and space.axes and space.size < 2:
             raise ArgumentError(
                 "rounded=true: the space has a single bin, to which all points would be rounded; "
@@ -51,12 +44,6 @@ class Points:
         if not space.axes:
             refuse_unfit_bins(space)
         refuse_many_bins(space)
-        if space.size > MANY:
-            warnings.warn(
-                f"space: {space.size:,} bins, all of which every level is compared with, which is "
-                "slow; give its axes fewer, such as bins=1 with rounded=false",
-                stacklevel=2,
-            )
         self._space, self._rounded = space, rounded
         places = space.coordinates.double()
         self.size: int = places.shape[1]
@@ -110,13 +97,7 @@ class Points:
 
 
 def measured(outcome: TensorDictBase, measure: str) -> Tensor:
-    """Returns success or return of an outcome [K, n], whichever is the measure: float64 [K, n].
-
-    Raises:
-        ValueError: if the outcome has no success and success is the measure.
-    """
-    if measure not in outcome.keys():
-        raise ValueError(f"measure={measure}: the outcome has no success")
+    """Returns success or return of an outcome [K, n], whichever is the measure: float64 [K, n]."""
     return outcome[measure].double()
 
 

@@ -95,8 +95,6 @@ class ProblemProposer(Curriculum):
             ValueError: for several students: a Proposer learns from one.
             DivergedError: if an advantage, a loss, a gradient or a weight is not finite.
         """
-        if len(streams) != 1:
-            raise ValueError(f"a Proposer learns from one Solver, got {len(streams)}")
         (stream,), agent = streams, self.agent
         probes = self.target.sample(self._probe_levels, stream.generator("probes"))
         with torch.no_grad():

@@ -98,16 +98,10 @@ class LearningProgressCurriculum(BinCurriculum):
     def evidence(
         self, student: Student, batch: Batch, outcome: TensorDictBase
     ) -> dict[str, Tensor]:
-        """Returns what the episodes reached, if progress is measured by them.
-
-        Raises:
-            ValueError: if the outcome has no success and success is the measure.
-        """
+        """Returns what the episodes reached, if progress is measured by them."""
         measure = self._probes.measure
         if self._source == "exact":
             return {}
-        if measure not in outcome.keys():
-            raise ValueError(f"measure={measure}: the outcome has no success")
         return {"reached": outcome[measure].float().cpu()}
 
     def learn(self, evidence: TensorDict) -> None:

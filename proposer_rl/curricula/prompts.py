@@ -96,8 +96,6 @@ class ItemCurriculum(Curriculum):
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Keeps what came of items, which the next proposal learns from."""
         self._inbox.check(batch, outcome)
-        if "success" not in outcome.keys():
-            raise ValueError(f"{type(self).__name__}: the outcome has no success")
         success = outcome["success"].double().cpu()
         counts = torch.ones_like(success)
         if "rollout" not in outcome.keys():  # whose success is that of its first episode

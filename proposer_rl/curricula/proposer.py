@@ -144,13 +144,11 @@ class ProposerTrainer:
         replicas: trains the replicas; None for the learner's own environment, in this process.
 
     Raises:
-        ValueError: for an environment of another kind, or a horizon other than the episode's.
+        ValueError: for a horizon other than the episode's.
     """
 
     def __init__(self, learner: PPO, replicas: Replicas | None = None) -> None:
-        env = learner.env
-        if not isinstance(env, SolverTrainingEnv):
-            raise ValueError("the Proposer's environment must be a SolverTrainingEnv")
+        env: SolverTrainingEnv = learner.env
         if learner.settings.horizon != env.steps:
             raise ValueError(
                 f"the Proposer's horizon {learner.settings.horizon} must be the "

@@ -115,16 +115,6 @@ class ReplayCurriculum(Curriculum):
         seeds: Sequence[int] = (0,),
     ) -> None:
         synchronous = not train_on_new if synchronous is None else synchronous
-        if train_on_new and synchronous:
-            raise ArgumentError(
-                "train_on_new=true, synchronous=true: new levels are either trained on or only "
-                "scored, beside every update"
-            )
-        if renew and co_learnability:
-            raise ArgumentError(
-                f"co_learnability={co_learnability}, renew=true: where all scores are renewed "
-                "before each draw, what is added to them is lost"
-            )
         if edits and edit is None:
             raise ArgumentError(
                 f"edits={edits}: the task has no edit(levels, count, generators) of its levels; "
@@ -436,8 +426,6 @@ def easiness(student: Student, outcome: TensorDictBase) -> Tensor:
 
     The authors' code (dcd) takes the levels with the lowest return minus value loss.
     """
-    if "rollout" not in outcome.keys():
-        raise ValueError("parents=easy: the outcome has no rollout")
     rollout = outcome["rollout"]
     ended = episodes(rollout)
     loss = Scorer("l1_value_loss", "episodes")

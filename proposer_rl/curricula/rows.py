@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from math import prod
 from typing import Annotated, Any
@@ -63,15 +62,12 @@ class RowsCurriculum(Curriculum):
         name = row or ("row" if "row" in names else names[0])
         if name not in names:
             raise ArgumentError(f"row={name}: unknown; there are: {', '.join(names)}")
-        if lower > upper:
-            raise ArgumentError(f"lower={lower}: must be at most upper={upper}")
         sizes = [len(values) for values in space.axes.values()]
         axis = names.index(name)
         self._rows = sizes[axis]
         if self._rows < 2:
             raise ArgumentError(f"row={name}: has a single row; give it bins")
         refuse_many_bins(space)
-        _warn_of_merged(space, name)
         # The number of a bin is (before * rows + row) * after + rest.
         self._before, self._after = prod(sizes[:axis]), prod(sizes[axis + 1 :])
         self.space, self._start = space, min(start, self._rows - 1)
@@ -125,15 +121,3 @@ class RowsCurriculum(Curriculum):
             "mean_row": self._last.double().mean(1).tolist(),
             "last_row": (self._last == self._rows - 1).double().mean(1).tolist(),
         }
-
-
-def _warn_of_merged(space: Any, name: str) -> None:
-    """Warns of whole numbers that share a row, which were rows perhaps themselves."""
-    part = getattr(space, "bins", {}).get(name)
-    if part is not None and not part.low.is_floating_point() and bool((part.low < part.high).any()):
-        numbers = int(part.high[-1] - part.low[0]) + 1
-        warnings.warn(
-            f"{name}: {numbers} whole numbers in {len(part.low)} rows; "
-            f"bins={{{name!r}: {numbers}}} gives each its own",
-            stacklevel=2,
-        )

@@ -13,7 +13,7 @@ from proposer_rl.curricula.contract import Batch, Curriculum
 from proposer_rl.curricula.scores import Scorer
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import DivergedError
-from proposer_rl.settings import ArgumentError, Count, Share, checked
+from proposer_rl.settings import Count, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels
 
@@ -68,8 +68,6 @@ class SelectionCurriculum(Curriculum):
         every: Count = 10,
         new: Share = 0.5,
     ) -> None:
-        if keep > candidates:
-            raise ArgumentError(f"keep={keep}: must be at most candidates={candidates}")
         self.needs, self.reads = scorer.needs, scorer.plays_for
         self._candidates, self._keep, self._every, self._new = candidates, keep, every, new
         self._new_levels, self.scorer = space, scorer

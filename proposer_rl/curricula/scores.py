@@ -225,13 +225,7 @@ class Scorer:
             best: see :meth:`of_rollouts`.
             before: the return of each level when it was trained on before, float [K, n]; minus
                 infinity where nothing is known.
-
-        Raises:
-            ValueError: if the outcome lacks what ``reads`` names.
         """
-        for entry in self.reads:
-            if not {entry, "rollout"} & {*outcome.keys()}:
-                raise ValueError(f"score={self._name}: the outcome has no {entry}")
         if self._own is not None:
             reached = outcome["return"].float().cpu()
             scored = Scored(self._by_own(student, outcome), torch.maximum(best, reached))
@@ -384,8 +378,6 @@ def _own_score(score: str | OwnScore) -> OwnScore | None:
         found: OwnScore = resolve_name(score)
     except (ImportError, AttributeError, ValueError) as error:
         raise ArgumentError(f"score={score}: {error}") from error
-    if not callable(found):
-        raise ArgumentError(f"score={score}: must be a function")
     return found
 
 

@@ -16,8 +16,7 @@ from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.points import Place, Points, measured
 from proposer_rl.curricula.student import Student
-from proposer_rl.curricula.transport import shares_of_bins
-from proposer_rl.settings import ArgumentError, Count, Positive, checked
+from proposer_rl.settings import Count, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Space
 
@@ -82,17 +81,13 @@ class SelfPacedCurriculum(Curriculum):
         measure: Measure = "success",
         rounded: bool = True,
     ) -> None:
-        if deviation < least_deviation:
-            raise ArgumentError(
-                f"deviation={deviation}: must be at least least_deviation={least_deviation}"
-            )
         self.space, self._points = space, Points(space, rounded)
         self.reads = ("success",) if measure == "success" else ()
         self._limits = delta, epsilon, least_deviation
         self._every, self._measure = episodes, measure
         if rounded:
             places = space.coordinates.double()
-            shares = shares_of_bins(target_shares, space).unsqueeze(-1)
+            shares = (target_shares.double() / target_shares.double().sum()).unsqueeze(-1)
         else:
             place: Any = space  # only one of continuous parameters knows the points of levels
             places = place.place(target.sample(SAMPLED, Streams(0).generator("target")))

@@ -50,7 +50,7 @@ class TransportCurriculum(BinCurriculum):
             in all bins of the target; then of the share of the target where it still is.
 
     Raises:
-        ArgumentError: if there is not one share for each bin, or there are too many bins.
+        ArgumentError: if there are too many bins.
     """
 
     shown = ("performance",)
@@ -81,7 +81,7 @@ class TransportCurriculum(BinCurriculum):
         self._exploration = exploration
         self._delta, self._epsilon = delta, epsilon
         self._probes = Probes(space, probes, measure)
-        self._target = shares_of_bins(target_shares, space).numpy()
+        self._target = (target_shares.double() / target_shares.double().sum()).numpy()
         self._costs = squared_distances(space)
 
     def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
@@ -119,19 +119,6 @@ class TransportCurriculum(BinCurriculum):
             record["allowed_bins"] = self.scores["allowed"].sum(-1).tolist()
             record["target_distance"] = self.scores["distance"].squeeze(-1).tolist()
         return record
-
-
-def shares_of_bins(shares: Tensor, space: Space) -> Tensor:
-    """Returns shares of the bins of a space scaled so that they add up to one: float64 [N].
-
-    Raises:
-        ArgumentError: if there is not one share for each bin.
-    """
-    if shares.shape != (space.size,):
-        raise ArgumentError(
-            f"target_shares={list(shares.shape)}: must be one for each of {space.size} bins"
-        )
-    return shares.double() / shares.double().sum()
 
 
 def squared_distances(space: Space) -> Tensor:

@@ -74,18 +74,10 @@ class SolverView:
     Args:
         task: gives the target distribution, and evaluates Solvers on its levels.
         validation_levels: number E of levels that performance is measured on.
-        probe_levels: number C of levels whose answers are shown; at most E.
-
-    Raises:
-        ValueError: if a size is out of range.
+        probe_levels: number C of levels whose answers are shown.
     """
 
     def __init__(self, task: Task, *, validation_levels: int, probe_levels: int) -> None:
-        if validation_levels < 1 or not 0 <= probe_levels <= validation_levels:
-            raise ValueError(
-                f"probe_levels={probe_levels} must be at least 0 and at most validation_levels="
-                f"{validation_levels}: the Proposer is shown no more than it is rewarded for"
-            )
         self.task = task
         self.validation_levels = validation_levels
         self.probe_levels = probe_levels
@@ -169,7 +161,7 @@ class SolverTrainingEnv(EnvBase):
             e.g. by a progress bar; what it raises ends the episode.
 
     Raises:
-        ValueError: if the Solvers are no population, or ``action_repeat`` does not divide L.
+        ValueError: if ``action_repeat`` does not divide L.
         ArgumentError: in a step, if the reward is not one number for each Solver.
     """
 
@@ -185,13 +177,12 @@ class SolverTrainingEnv(EnvBase):
         first_replica: int = 0,
         on_update: Callable[[int], None] | None = None,
     ) -> None:
-        if solvers.copies is None:
-            raise ValueError("the Solvers must be a population: their agent has no copies")
         if min(meta_episode_length, action_repeat) < 1 or meta_episode_length % action_repeat:
             raise ValueError(
                 f"action_repeat={action_repeat} must divide "
                 f"meta_episode_length={meta_episode_length}"
             )
+        assert solvers.copies is not None  # a population
         self._replicas = range(first_replica, first_replica + solvers.copies)
         super().__init__(device=solvers.env.device, batch_size=[len(self._replicas)])
         self.solvers = solvers

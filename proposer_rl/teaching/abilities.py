@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from proposer_rl.curricula.batches import moved
-from proposer_rl.settings import ArgumentError
 
 OF_LEVELS = ("optimal_return", "exact_performance", "performance", "play")
 
@@ -27,14 +26,9 @@ def adapted(
         function: of a loop, called with levels as the loop gets them.
         given: makes these of levels.
         device: on which it gets them; None to leave them where they are.
-
-    Raises:
-        ArgumentError: if it is no function.
     """
     if name not in OF_LEVELS:
         return function
-    if not callable(function):
-        raise ArgumentError(f"{name}={function!r:.60}: must be a function of levels")
 
     def of_one(levels: Any, *more: Any) -> Any:
         some = levels[0] if levels.ndim > 1 else levels

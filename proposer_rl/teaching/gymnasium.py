@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from torch import Tensor
 
-from proposer_rl.settings import ArgumentError, shown
+from proposer_rl.settings import ArgumentError
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, as_number, entries, stepped
 from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write_attribute
 from proposer_rl.tasks.parameters import SEED
@@ -26,11 +26,13 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     ``info`` has the ``level`` and its ticket ``level_id`` after a reset and after the last step.
     Wrappers that end episodes, as ``TimeLimit``, belong inside: an episode that a reset cuts off
     counts for nothing, of which the second warns. In vector environments every environment has its
-    wrapper, and all of them the same teacher, in other processes its client.
+    wrapper, and all of them the same teacher, in other processes its client. An environment has one
+    ``TaughtEnv``: a second one around it is refused, and one that is put around what is inside
+    takes the place of the first.
 
     Args:
         env: the environment.
-        teacher: of one student; in another process than its own, its client.
+        teacher: in another process than its own, its client.
         set: how a level gets into the environment before its reset: attributes of the unwrapped
             environment by the parameters' names, as in ``{"gravity": "model.opt.gravity.2"}``; or a
             function of the unwrapped environment and the level; or ``"options"`` for those of the
@@ -43,10 +45,11 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             where wrappers outside end episodes.
 
     Raises:
-        ArgumentError: if the teacher is of several students; at a reset, if the environment has no
-            such attribute, more than a number there, or another value afterwards; in a step, if it
-            returns something else than Gymnasium's interface says; at the first end, if the
-            curriculum reads success and nothing says it.
+        ArgumentError: if the environment has a ``TaughtEnv``, or the curriculum reads rollouts; at
+            a reset, if the environment has no such attribute, more than a number there, or another
+            value afterwards; in a step, if it returns something else than Gymnasium's interface
+            says; at the first end, if the curriculum reads success and nothing says it; later, if
+            another ``TaughtEnv`` has taken this one's place.
     """
 
     def __init__(
@@ -59,13 +62,21 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         once: bool = False,
         reset_truncates: bool = False,
     ) -> None:
+        inner = env
+        while isinstance(inner, gymnasium.Wrapper):
+            if isinstance(inner, TaughtEnv):
+                raise ArgumentError(
+                    "env: has a TaughtEnv already, as where a cell is run twice: each would set a "
+                    "level of its own; make the environment anew, or give env.unwrapped"
+                )
+            inner = inner.env
         super().__init__(env)
-        if teacher.students != 1 or "rollout" in teacher.reads:
-            raise ArgumentError("teacher: must be of one student, and of a curriculum that is told")
-        if not (isinstance(set, Mapping) or callable(set) or set == "options"):
+        if "rollout" in teacher.reads:
+            raise ArgumentError("teacher: its curriculum reads rollouts, which this does not give")
+        if isinstance(set, str) and set != "options":
             raise ArgumentError(f"set={set!r}: must be attributes, a function or 'options'")
-        if not (success is None or isinstance(success, str) or callable(success)):
-            raise ArgumentError(f"success={success!r}: must be an entry, a function or None")
+        # By which an environment knows its teacher, and a copy of it that of the copy.
+        self._own = self.unwrapped._taught = [id(self)]  # type: ignore[attr-defined]
         self._teacher, self._how, self._rule = teacher, set, success
         self._once, self._reset_truncates = once, reset_truncates
         self._ticket: int | None = None
@@ -76,6 +87,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begins an episode on the next level."""
+        self._require_own()
         self._drop()
         self._ticket, self._level = self._teacher.ask()
         self._return, self._steps = 0.0, 0
@@ -83,11 +95,6 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         if callable(self._how):
             self._how(self.env.unwrapped, self._level)
         elif isinstance(self._how, str):
-            if not isinstance(self._level, Mapping):
-                raise ArgumentError(
-                    f"set='options': must be a function, as this level has no names: "
-                    f"{shown(self._level)}"
-                )
             options = {**(options or {}), **self._level}
         else:
             self._set(self._how)
@@ -105,6 +112,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Makes a step; after the last one of an episode the teacher gets return and success."""
+        self._require_own()
         try:
             answer = stepped(self.env.step(action))
         except UnfitEnvironmentError as error:
@@ -122,6 +130,10 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             elif self._once:
                 self._note(self._success())
         return observation, reward, terminated, truncated, info
+
+    def _require_own(self) -> None:
+        if self.unwrapped._taught is not self._own:  # type: ignore[attr-defined]
+            raise ArgumentError("env: another TaughtEnv has been put around it since; use that")
 
     def _end(self) -> None:
         """Reports the episode to the teacher."""
@@ -159,10 +171,6 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Sets attributes of the environment to the values of the level."""
         names = [*self._level.keys()] if isinstance(self._level, Mapping) else []
         for name, path in how.items():
-            if name not in names:
-                raise ArgumentError(
-                    f"set.{name}: no parameter; there are: {', '.join(names) or 'none'}"
-                )
             try:
                 write_attribute(self.env.unwrapped, path, _plain(self._level[name]))
             except AttributeRefusedError as error:

@@ -9,15 +9,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 
 from proposer_rl.curricula import outcome_of
-from proposer_rl.settings import ArgumentError, shown
-from proposer_rl.tasks.parameters import LARGEST
+from proposer_rl.settings import ArgumentError
+from proposer_rl.teaching.numbers import as_numbers
 
 RESULTS = ("return", "success", "score", "episodes", "steps")
 COUNTS = ("episodes", "steps")
-MOST_COUNTED = 1e15  # of these, which float64 still counts one by one
+MOST = 1e15  # of these, which float64 still counts one by one
+BOUNDS = {"success": (0, 1), "episodes": (1, MOST), "steps": (0, MOST)}
 LEVEL_ID = "level_id"
 MASK = ("collector", "mask")  # of the steps that are some, where trajectories were split
 ENDS = ("done", "terminated", "truncated", "success")
@@ -43,129 +43,25 @@ def by_name(outcome: Any) -> dict[str, Any]:
     """Returns the results of an outcome, or its rollout alone where it has one.
 
     Raises:
-        ArgumentError: if it has no names, no return, or a name that means nothing here.
+        ArgumentError: for a name that means nothing here.
     """
-    if not hasattr(outcome, "keys"):
-        raise ArgumentError(f"outcome={shown(outcome)}: must have results by name, as return")
     names = [*outcome.keys()]
     if "rollout" in names:
         return {"rollout": outcome["rollout"]}
-    if "return" not in names:
-        raise ArgumentError(f"outcome={sorted(names)}: has no return")
     if unknown := [name for name in names if name not in RESULTS]:
         raise ArgumentError(f"outcome.{unknown[0]}: unknown; there are: {', '.join(RESULTS)}")
     return {name: outcome[name] for name in names}
 
 
-def as_device(device: Any) -> torch.device:
-    """Returns a device of this machine.
+def as_result(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Reads the results of a name, [n] or of one level; one count may stand for all.
 
     Raises:
-        ArgumentError: if there is no such device.
+        ArgumentError: naming the argument, see :func:`as_numbers`.
     """
-    try:
-        return torch.empty(0, device=torch.device(device)).device
-    except (RuntimeError, AssertionError, TypeError) as error:
-        line = str(error).partition("\n")[0]
-        raise ArgumentError(f"device={device}: must be one that torch has here: {line}") from error
-
-
-def as_array(
-    name: str, value: Any, shape: tuple[int, ...], for_all: bool = False
-) -> NDArray[np.float64]:
-    """Returns numbers as an array of a shape on the CPU, whatever they are given as.
-
-    Args:
-        name: of the argument.
-        value: the numbers; of one level without that dimension, too.
-        shape: [n] or [K, n].
-        for_all: whether one number may stand for all.
-
-    Raises:
-        ArgumentError: naming the argument, if it has another shape or a number that is not finite
-            in float32, or not allowed.
-    """
-    if isinstance(value, Tensor) and not value.is_complex():
-        value = value.detach().cpu().double()  # NumPy has no bfloat16
-    try:
-        array = np.asarray(value)
-        if array.dtype.kind not in "biufO":  # such as complex numbers and texts
-            raise TypeError(array.dtype)
-        array = array.astype(np.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        # RuntimeError: tensors with a gradient; OverflowError: an integer beyond float64.
-        raise ArgumentError(f"{name}={shown(value)}: must be numbers of float32") from error
-    if for_all and not array.ndim:
-        array = np.full(shape, array)
-    if shape[-1] == 1 and array.shape == shape[:-1]:
-        array = array[..., np.newaxis]
-    if array.shape != shape:
-        raise ArgumentError(
-            f"{name}: has shape {list(array.shape)}, but must have {list(shape)}: one number for "
-            "each level"
-        )
-    if (wrong := array[~(np.abs(array) <= LARGEST)]).size:  # results are kept in float32
-        raise ArgumentError(f"{name}={wrong[0]}: must be finite in float32")
-    check_values(name, array)
-    return array
-
-
-def as_number(name: str, value: Any) -> float:
-    """Returns one result as a number.
-
-    Raises:
-        ArgumentError: see :func:`as_array`.
-    """
-    try:
-        number = float(value)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        given = f"{argument(name)}={shown(value)}"
-        raise ArgumentError(f"{given}: must be a number of float32") from error
-    if not -LARGEST <= number <= LARGEST:
-        raise ArgumentError(f"{argument(name)}={number}: must be finite in float32")
-    # Arrays take a while to make; few numbers need one.
-    if name in COUNTS or (name == "success" and not 0 <= number <= 1):
-        check_values(name, np.array([number]))
-    return number
-
-
-def argument(name: str) -> str:
-    """Returns the name of the argument that a result is given as."""
-    return "return_" if name == "return" else name
-
-
-def as_ids(ids: Any) -> NDArray[np.int64]:
-    """Returns tickets as an array [n] on the CPU.
-
-    Raises:
-        ArgumentError: if they are no whole numbers [n].
-    """
-    array = np.asarray(ids.detach().cpu() if isinstance(ids, Tensor) else ids)
-    if array.size == 0:
-        return np.zeros(0, np.int64)
-    if array.ndim > 1 or array.dtype.kind not in "iu":
-        raise ArgumentError(
-            f"ids: must be whole numbers [n], got {array.dtype} {list(array.shape)}"
-        )
-    return array.reshape(-1).astype(np.int64)
-
-
-def check_values(name: str, array: NDArray[np.float64]) -> None:
-    """Refuses what is no share of successes, or no count.
-
-    Raises:
-        ArgumentError: naming the argument.
-    """
-    if name == "success":
-        wrong, allowed = array[(array < 0) | (array > 1)], "from 0 to 1"
-    elif name in COUNTS:
-        least = int(name == "episodes")
-        wrong = array[(array < least) | (array > MOST_COUNTED) | (array % 1 != 0)]
-        allowed = f"a whole number, at least {least} and at most {MOST_COUNTED:g}"
-    else:
-        return
-    if wrong.size:
-        raise ArgumentError(f"{name}={wrong[0]:g}: must be {allowed}")
+    given, counts = "return_" if name == "return" else name, name in COUNTS
+    spread = shape == (1,) or (counts and shape != ())
+    return as_numbers(given, value, shape, *BOUNDS.get(name, ()), whole=counts, spread=spread)
 
 
 def outcome_of_rollout(rollout: TensorDictBase, rule: Any) -> TensorDict:
@@ -200,7 +96,7 @@ def ended(
         be kept for the next rollout.
 
     Raises:
-        ArgumentError: if it does not say which levels it is of, or has no reward or done.
+        ArgumentError: if it does not say which levels it is of.
     """
     if LEVEL_ID not in rollout.keys():
         raise ArgumentError(
@@ -208,9 +104,6 @@ def ended(
             "began; put LevelTransform around the environment, or give outcome_of(rollout) "
             "where each row begins with a reset on its level"
         )
-    for name in ("reward", "done"):
-        if name not in rollout["next"].keys():
-            raise ArgumentError(f"rollout: has no {name} in next, one number for each environment")
     steps: Any = rollout.contiguous().flatten()  # also where it is stacked lazily
     if MASK in rollout.keys(True):  # rows are filled up to one length
         steps = steps[rollout[MASK].reshape(-1)]

@@ -7,8 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from math import inf, isfinite
-from operator import index
+from math import inf
 from typing import Any, NamedTuple, TypeVar
 from zlib import crc32
 
@@ -17,6 +16,8 @@ from torch import Tensor, distributed
 from torch.utils.data import Sampler
 
 from proposer_rl.settings import ArgumentError, Count, checked
+from proposer_rl.teaching.numbers import as_ids, as_numbers
+from proposer_rl.teaching.results import MOST
 from proposer_rl.teaching.spaces import Items
 from proposer_rl.teaching.teacher import Teacher
 
@@ -64,8 +65,7 @@ class TeacherSampler(Sampler[int]):
         sources: where each item is from, [N], by which :meth:`metrics` are given, too.
 
     Raises:
-        ArgumentError: if the teacher's levels are no items, or those of several students, or not
-            each has a source.
+        ArgumentError: if the teacher's levels are no items, or not each has a source.
     """
 
     @checked
@@ -148,7 +148,7 @@ class TeacherSampler(Sampler[int]):
             self._came.clear()
             self._epoch, self._goes_on = Epoch(), False
         else:
-            self._count(lambda: [(item, None) for item in _whole(items)])
+            self._count(lambda: [(item, None) for item in as_ids("items", items).tolist()])
 
     def metrics(self) -> dict[str, float]:
         """Returns means over the groups that were complete since the last call.
@@ -318,7 +318,7 @@ def mixed_groups(
 
     Raises:
         ArgumentError: if its results are no such numbers, or G is 1 or another than before, whose
-            items are dropped then; if the teacher's levels are no items of one student.
+            items are dropped then; if the teacher's levels are no items.
     """
     items_of(teacher)
     drawn: list[int] = []
@@ -328,10 +328,14 @@ def mixed_groups(
     for _ in range(most):
         tickets, items = teacher.ask(count - len(places))
         try:
-            success = _of_groups(generate(items.tolist()), len(items))
-            if groups and success.shape[1] != groups[0].shape[1]:
-                sizes = f"{success.shape[1]} answers, first {groups[0].shape[1]}"
-                raise ArgumentError(f"generate: must give groups of one size: {sizes}")
+            given = as_numbers("generate", generate(items.tolist()), (len(items), None), 0, 1)
+            success = torch.from_numpy(given)
+            size = success.shape[1]
+            if size < 2 or (groups and size != groups[0].shape[1]):
+                before = f", first {groups[0].shape[1]}" if groups else ""
+                raise ArgumentError(
+                    f"generate: must give groups of one size from 2, got {size}{before}"
+                )
             means = success.mean(1)
             teacher.tell(tickets, means, means, episodes=success.shape[1])
         except BaseException:
@@ -351,30 +355,14 @@ def mixed_groups(
 
 
 def items_of(teacher: Teacher) -> Items:
-    """Returns the items that a teacher proposes to its student.
+    """Returns the items that a teacher proposes.
 
     Raises:
-        ArgumentError: if its levels are no items, or it has several students.
+        ArgumentError: if its levels are no items.
     """
-    if not isinstance(teacher.space, Items) or teacher.students > 1:
-        raise ArgumentError("teacher: must have a space of Items, and one student")
+    if not isinstance(teacher.space, Items):
+        raise ArgumentError("teacher: must have a space of Items")
     return teacher.space
-
-
-def _of_groups(given: Any, count: int) -> Tensor:
-    """Returns the success of answers to so many items, float64 [n, G]."""
-    try:
-        if isinstance(given, list | tuple):
-            given = [row.tolist() if isinstance(row, Tensor) else row for row in given]
-        success = torch.as_tensor(given).detach().double().cpu()
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ArgumentError("generate: must give numbers [n, G]") from error
-    if success.ndim != 2 or len(success) != count or success.shape[1] < 2:
-        shape = list(success.shape)
-        raise ArgumentError(f"generate={shape}: must give results [{count}, G], G at least 2")
-    if not ((success >= 0) & (success <= 1)).all():
-        raise ArgumentError("generate: must give results from 0 to 1")
-    return success
 
 
 def _everywhere(read: Callable[[], list[T]], trace: int) -> list[T]:
@@ -403,38 +391,21 @@ def _answers(
     items: Any, success: Any, return_: Any, episodes: Any
 ) -> list[tuple[int, Answer | None]]:
     """Returns the answers to items [n], each with its item."""
-    numbers, shares = _whole(items), _numbers("success", success)
-    returns = shares if return_ is None else _numbers("return_", return_)
-    counts = [1.0] * len(numbers) if episodes is None else _numbers("episodes", episodes)
-    for name, values in (("success", shares), ("return_", returns), ("episodes", counts)):
-        if len(values) != len(numbers):
-            raise ArgumentError(f"{name}: {len(values)} results for {len(numbers)} items")
-    answers: list[tuple[int, Answer | None]] = []
-    for item, share, number, count in zip(numbers, shares, returns, counts, strict=True):
-        if share is None:
-            answers.append((item, None))
-            continue
-        if not 0 <= share <= 1:
-            raise ArgumentError(f"success={share:g}: must be from 0 to 1")
-        if number is None or not isfinite(number):
-            raise ArgumentError(f"return_={number}: must be finite")
-        if count is None or not (1 <= count < inf and count == int(count)):
-            raise ArgumentError(f"episodes={count}: must be a whole number from 1")
-        answers.append((item, Answer(share, number, count)))
-    return answers
+    numbers = as_ids("items", items).tolist()
+    count = len(numbers)
+    came = [True] * count
+    if isinstance(success, list | tuple):
+        came = [one is not None for one in success]
 
+    def read(name: str, values: Any, *bounds: float, whole: bool = False) -> list[float]:
+        if isinstance(values, list | tuple) and len(values) == len(came):
+            values = [one if there else 1 for one, there in zip(values, came, strict=True)]
+        found: list[float] = as_numbers(name, values, (count,), *bounds, whole=whole).tolist()
+        return found
 
-def _whole(items: Any) -> list[int]:
-    return _plain("items: must be whole numbers [n]", items, index)
-
-
-def _numbers(name: str, values: Any) -> list[float | None]:
-    return _plain(f"{name}: must be numbers [n]", values, lambda v: None if v is None else float(v))
-
-
-def _plain(line: str, values: Any, kind: Callable[[Any], T]) -> list[T]:
-    """Converts values [n] one by one, brought from a device all at once."""
-    try:
-        return [*map(kind, values.tolist() if hasattr(values, "tolist") else values)]
-    except (TypeError, ValueError) as error:
-        raise ArgumentError(line) from error
+    shares = read("success", success, 0, 1)
+    returns = shares if return_ is None else read("return_", return_)
+    counts = [1.0] * count if episodes is None else read("episodes", episodes, 1, MOST, whole=True)
+    answers = map(Answer, shares, returns, counts)
+    each = zip(numbers, answers, came, strict=True)
+    return [(item, answer if there else None) for item, answer, there in each]

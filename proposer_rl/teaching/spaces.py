@@ -27,8 +27,8 @@ from proposer_rl.tasks.ranges import (
     read_part,
     target_in_file,
 )
+from proposer_rl.teaching.numbers import as_numbers
 from proposer_rl.teaching.tables import (
-    doubles,
     expected_log_odds,
     few_columns,
     item_table,
@@ -37,7 +37,6 @@ from proposer_rl.teaching.tables import (
 )
 
 DRAWN = "level"  # the entry that holds a generator's tensors
-FAR = 10.0  # of a feature, from 0
 Ranges = Mapping[str, Any]
 T = TypeVar("T")
 
@@ -54,8 +53,6 @@ class LevelSpace:
 
     distributions: Mapping[str, Distribution]
     _features: Features | None = None
-    _width: int | None = None  # of a row of features, once there was one
-    _far = False  # whether one was far from 0
 
     @property
     def space(self) -> LevelSpace:
@@ -79,35 +76,11 @@ class LevelSpace:
         return {"kind": type(self).__qualname__}
 
     def features(self, levels: Levels) -> Tensor:
-        """Returns what a model of outcomes knows of levels: float [*B, F].
-
-        Raises:
-            ArgumentError: if a function gives it, and no finite numbers, F of each level.
-        """
+        """Returns what a model of outcomes knows of levels: float [*B, F]."""
         if self._features is None:
             return space_features(self, levels)
         shape = levels.shape
         known = number_table(self._features(self.given(levels.reshape(-1))))
-        if known.ndim != 2 or len(known) != shape.numel():
-            raise ArgumentError(
-                f"features={list(known.shape)}: must give a row of numbers for each of "
-                f"{shape.numel()} levels"
-            )
-        self._width = known.shape[1] if self._width is None else self._width
-        if known.shape[1] != self._width:
-            raise ArgumentError(
-                f"features={list(known.shape)}: must give rows of one length, first {self._width}"
-            )
-        if not known.float().isfinite().all():
-            raise ArgumentError(f"features={shown(known.tolist())}: must give finite float32")
-        most = float(known.abs().max()) if known.numel() else 0.0
-        if most > FAR and not self._far:
-            self._far = True
-            warnings.warn(
-                f"features={most:g}: each should be about -1 to 1; of others a model of outcomes "
-                "can learn little, and the largest decide which levels are near",
-                stacklevel=2,
-            )
         return known.reshape(*shape, known.shape[1])
 
     def given(self, levels: Levels) -> Any:
@@ -129,8 +102,8 @@ class Parameters(LevelSpace, ParameterSpace):
         ranges: of each parameter, by name: ``(low, high)`` for a continuous range, ``range(a, b)``
             for whole numbers, a list or an array for choices among rising numbers, or among texts.
             Or what task files have: ``{"low", "high", "bins", "target"}`` or ``{"values",
-            "target"}``. YAML and JSON have no tuples: their ``[5.0, 25.0]`` is two choices, of
-            which is warned, but as the target of such a mapping a range.
+            "target"}``. YAML and JSON have no tuples: their ``[5.0, 25.0]`` is two choices, but as
+            the target of such a mapping a range.
         bins: equal parts of a range that curricula tell apart; one number for all, or by name. Of
             twenty parameters or more, 1.
         target: what is to be mastered, for some of the parameters, by name: values, or a part of
@@ -163,12 +136,6 @@ class Parameters(LevelSpace, ParameterSpace):
         seeded: bool = False,
     ) -> None:
         check_torch_defaults()
-        _check_names("ranges", ranges, ranges)
-        if not ranges:
-            raise ArgumentError("ranges={}: must have at least one parameter")
-        for name in ranges:
-            if not isinstance(name, str):
-                raise ArgumentError(f"ranges.{name}: must have a text as its name")
         if seeded and SEED in ranges:
             raise ArgumentError("ranges.seed, seeded=True: a level has one seed; leave out either")
         counts = dict.fromkeys(ranges, 8)
@@ -194,8 +161,6 @@ class Parameters(LevelSpace, ParameterSpace):
                 "bins=1, which suffices for curricula that need none"
             ) from error
         self.labels = {name: getattr(part, "labels", None) for name, part in parts.items()}
-        for name, labels in self.labels.items():
-            _warn_of_places(f"ranges.{name}", labels or [])
         if in_file:
             _check_names("target", target or {}, parts)
             read = {name: target_in_file(one, parts[name]) for name, one in in_file.items()}
@@ -203,10 +168,6 @@ class Parameters(LevelSpace, ParameterSpace):
         said = _distributions(target, named)
         self._parts = {name: self._part(name, part) for name, part in said.items()}
         further = {name: ParameterSpace(part, seeded) for name, part in self._parts.items()}
-        for key, part in {"ranges": ranges, **said}.items():
-            for name, values in part.items():
-                if key == "ranges" or parts[name].wide:
-                    _warn_of_two(f"{key}.{name}", python_values(values))
         self.distributions = {"all": self, **further}
 
     @property
@@ -327,15 +288,17 @@ class Items(LevelSpace):
             number = lines[tuple(wrong[0])]
             what = f"must be finite in float32, as of item {int(wrong[0, 0])}"
             raise ArgumentError(f"features={number:g}: {what}")
-        self.pass_rates = None if pass_rates is None else _rates(pass_rates, count)
+        self.pass_rates = None
+        if pass_rates is not None:
+            rates = as_numbers("pass_rates", pass_rates, (count,), 0, 1, unknown=True)
+            self.pass_rates = torch.from_numpy(rates)
         self.expected = None if self.pass_rates is None else expected_log_odds(self.pass_rates)
-        rates = torch.zeros(count, 0)
+        columns = known = torch.zeros(count, 0)
         if self.pass_rates is not None:
-            rates = rate_columns(self.pass_rates)
-        known = torch.zeros(count, 0)
+            columns = rate_columns(self.pass_rates)
         if features is not None:
-            known = few_columns(lines, others=rates.shape[1])
-        self._inputs = torch.cat([known, rates], 1)
+            known = few_columns(lines, others=columns.shape[1])
+        self._inputs = torch.cat([known, columns], 1)
         low, high = lines.amin(0), lines.amax(0)
         self.coordinates = (2 * (lines - low) / (high - low).clamp_min(1e-12) - 1).float()
         parts: dict[str, _SomeItems] = {}
@@ -422,8 +385,7 @@ class LevelGenerator(LevelSpace):
         named: further functions like ``draw``, by name, for hand-designed curricula.
 
     Raises:
-        ArgumentError: if levels are no such thing, not as many as are asked for, or of other
-            entries and shapes than those before.
+        ArgumentError: if levels are no such thing, or not as many as are asked for.
     """
 
     def __init__(
@@ -437,10 +399,8 @@ class LevelGenerator(LevelSpace):
     ) -> None:
         self._features = features
         drawn = _distributions(target, named)
-        check_functions({"draw": draw, **drawn, "edit": edit or draw, "features": features or draw})
-        form: dict[Any, list[int]] = {}
-        parts = {name: _Drawn(name, function, form) for name, function in drawn.items()}
-        self.distributions = {"all": _Drawn("draw", draw, form), **parts}
+        parts = {name: _Drawn(name, function) for name, function in drawn.items()}
+        self.distributions = {"all": _Drawn("draw", draw), **parts}
         if edit is not None:
             self.edit = self._edits(edit)
 
@@ -480,50 +440,24 @@ class LevelGenerator(LevelSpace):
 
 
 class _Drawn:
-    """Draws levels by a function, all of one form: the shapes of a level's entries, by name."""
+    """Draws levels by a function."""
 
-    def __init__(
-        self,
-        name: str,
-        draw: Callable[[int, torch.Generator], Any],
-        form: dict[Any, list[int]],
-    ) -> None:
-        self._name, self._draw, self._form = name, draw, form
+    def __init__(self, name: str, draw: Callable[[int, torch.Generator], Any]) -> None:
+        self._name, self._draw = name, draw
 
     def sample(self, count: int, generator: torch.Generator) -> Levels:
-        taken = _taken(self._name, self._draw(count, generator), count)
-        form = {name: [*entry.shape[1:]] for name, entry in taken.items(True, True)}
-        if form != (self._form or form):
-            raise ArgumentError(f"{self._name}={form}: must give levels of one form, {self._form}")
-        self._form.update(form)
-        return taken
+        return _taken(self._name, self._draw(count, generator), count)
 
 
 def _taken(name: str, levels: Any, count: int) -> Levels:
     """Returns levels [count] that a function gives, as curricula take them."""
-    if isinstance(levels, np.ndarray) and levels.dtype.kind in "biuf":
+    if isinstance(levels, np.ndarray):
         levels = torch.from_numpy(levels.copy())
-    if not isinstance(levels, Tensor) and not is_tensor_collection(levels):
-        raise ArgumentError(
-            f"{name}={type(levels).__name__}: must give a tensor, a tensordict or a tensorclass"
-        )
-    if tuple(levels.shape[:1]) != (count,):
-        shape = list(levels.shape)
-        raise ArgumentError(f"{name}={shape}: must give {count} levels, [{count}, ...]")
-    return TensorDict({DRAWN: levels}, [count]) if isinstance(levels, Tensor) else levels
-
-
-def _rates(given: Any, count: int) -> Tensor:
-    """Returns pass rates, float64 [N]."""
-    try:
-        rates = doubles(given)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ArgumentError(f"pass_rates={shown(given)}: must be numbers [N]") from error
-    if rates.shape != (count,):
-        raise ArgumentError(f"pass_rates={list(rates.shape)}: must be one for each of {count}")
-    if (wrong := rates[(rates < 0) | (rates > 1)]).numel():
-        raise ArgumentError(f"pass_rates={wrong[0]:g}: must be from 0 to 1, or NaN")
-    return rates
+    collection = is_tensor_collection(levels)
+    if not (collection or isinstance(levels, Tensor)) or tuple(levels.shape[:1]) != (count,):
+        found = list(getattr(levels, "shape", ())) or type(levels).__name__
+        raise ArgumentError(f"{name}={found}: must give a tensor or tensordict of {count} levels")
+    return levels if collection else TensorDict({DRAWN: levels}, [count])
 
 
 def _hash(numbers: Tensor) -> str:
@@ -541,47 +475,13 @@ def _item_places(name: str, given: Any, count: int) -> list[int]:
 
 def _distributions(target: T | None, named: Mapping[str, T] | None) -> dict[str, T]:
     """Returns what is said of distributions beside the space itself, by their names."""
-    if not isinstance(named, Mapping | None):
-        raise ArgumentError(f"named={shown(named)}: must have distributions by their names")
     for name in named or {}:
         if name == "all" or (name == "target" and target is not None):
             raise ArgumentError(f"named.{name}: must have another name, which none has yet")
     return {**({} if target is None else {"target": target}), **(named or {})}
 
 
-def check_functions(given: Mapping[str, Any]) -> None:
-    """Refuses what is no function among arguments, by their names."""
-    for name, function in given.items():
-        if not callable(function):
-            raise ArgumentError(f"{name}={shown(function)}: must be a function")
-
-
-def _warn_of_two(key: str, values: Any) -> None:
-    """Warns of how a list is read that a file may have in place of a tuple."""
-    if isinstance(values, list) and len(values) == 2 and any(isinstance(v, float) for v in values):
-        low, high = values
-        warnings.warn(
-            f"{key}={values}: a list is single values, here two and nothing between them; the "
-            f"range from {low} to {high} is a tuple, ({low}, {high})",
-            stacklevel=3,
-        )
-
-
-def _warn_of_places(key: str, labels: Sequence[Any]) -> None:
-    """Warns of choices that are numbers or truth values, but other ones than their places."""
-    for place, label in enumerate(labels):
-        if isinstance(label, int | float) and label != place:
-            warnings.warn(
-                f"{key}={shown(labels)}: in batches a level has its place in this list, {place} "
-                f"for {label}, and the value itself one by one alone",
-                stacklevel=3,
-            )
-            return
-
-
 def _check_names(key: str, given: Mapping[str, Any], known: Mapping[str, Any]) -> None:
-    if not isinstance(given, Mapping):
-        raise ArgumentError(f"{key}={shown(given)}: must have ranges by the parameters' names")
     unknown = [name for name in given if name not in known]
     if unknown:
         raise ArgumentError(f"{key}.{unknown[0]}: unknown; there are: {', '.join(known)}")

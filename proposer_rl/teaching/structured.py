@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.settings import ArgumentError
 from proposer_rl.tasks.parameters import ParameterSpace
 from proposer_rl.teaching.spaces import (
     DRAWN,
@@ -17,7 +16,6 @@ from proposer_rl.teaching.spaces import (
     LevelSpace,
     Parameters,
     Ranges,
-    check_functions,
 )
 
 Make = Callable[[TensorDictBase, torch.Generator], Any]
@@ -38,7 +36,7 @@ class MadeLevels(Parameters):
         bins, target, named: see :class:`Parameters`.
 
     Raises:
-        ArgumentError: see :class:`Parameters`; if ``make`` does not give as many levels as asked.
+        ArgumentError: see :class:`Parameters`.
 
     Example:
         >>> def rows(values, generator):
@@ -59,7 +57,6 @@ class MadeLevels(Parameters):
         target: Ranges | None = None,
         named: Mapping[str, Ranges] | None = None,
     ) -> None:
-        check_functions({"make": make, "features": features or make})
         super().__init__(ranges, bins=bins, target=target, named=named)
         self._make, self._features = make, features
         parts = {name: _Made(part, self) for name, part in self._parts.items()}
@@ -69,9 +66,6 @@ class MadeLevels(Parameters):
         """Makes levels [n] of values of the parameters [n], and keeps these beside them."""
         kept = values.select(*self.bins)
         levels = self._make(kept.clone(), generator)
-        if not hasattr(levels, "shape") or tuple(levels.shape[:1]) != (len(kept),):
-            shape = list(getattr(levels, "shape", ())) or type(levels).__name__
-            raise ArgumentError(f"make={shape}: must give {len(kept)} levels, [{len(kept)}, ...]")
         return TensorDict({**kept, DRAWN: levels}, kept.batch_size)
 
     def inputs(self, levels: TensorDictBase) -> Tensor:

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from proposer_rl.curricula.belief import WIDEST
-from proposer_rl.settings import ArgumentError, shown
+from proposer_rl.settings import ArgumentError
+from proposer_rl.teaching.numbers import as_numbers
 
 MOST_TEXTS = 256  # that differ in a column, which is a category
 OUTLIER = 3.0  # standard deviations, beyond which a number of many counts as that
@@ -31,16 +32,11 @@ class Table(NamedTuple):
 
 
 def number_table(features: Any) -> Tensor:
-    """Returns numbers [N, D], whatever they are given as.
-
-    Raises:
-        ArgumentError: if they are no numbers.
-    """
+    """Returns numbers [N, D], whatever they are given as."""
     array = hasattr(features, "__array__") and not isinstance(features, Tensor)
-    try:
-        table = torch.as_tensor(np.array(features) if array else features)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ArgumentError(f"features={shown(features)}: must be numbers [N, D]") from error
+    if isinstance(features, np.ma.MaskedArray):
+        features = np.ma.filled(features.astype(np.float64), np.nan)
+    table = torch.as_tensor(np.array(features) if array else features)
     return table if table.is_floating_point() else table.long()  # small integers would overflow
 
 
@@ -56,11 +52,6 @@ def item_table(features: Any) -> Table:
     texts = [_begins_with_text(column) for column in columns.values()]
     if not columns or (not any(texts) and hasattr(features, "__array__")):
         return Table(number_table(features).detach().cpu(), None)
-    for name, column in columns.items():
-        if not hasattr(column, "__len__"):
-            raise ArgumentError(f"features.{name}={shown(column)}: must be a column, [N]")
-    if len({len(column) for column in columns.values()}) > 1:
-        raise ArgumentError(f"features={[*columns]}: must have columns of one length")
     parts, codes = [], []
     for (name, column), is_text in zip(columns.items(), texts, strict=True):
         if not is_text:
@@ -85,11 +76,8 @@ def _columns(features: Any) -> dict[str, Any]:
         return {str(name): column for name, column in features.items()}
     if isinstance(features, Tensor) or not _begins_with_text(features):
         return {}
-    try:
-        rows = [[row] if isinstance(row, str) else [*row] for row in features]
-        return {str(place): column for place, column in enumerate(zip(*rows, strict=True))}
-    except (TypeError, ValueError) as error:
-        raise ArgumentError("features: must have rows of one length") from error
+    rows = [[row] if isinstance(row, str) else [*row] for row in features]
+    return {str(place): column for place, column in enumerate(zip(*rows, strict=True))}
 
 
 def _begins_with_text(cells: Any) -> bool:
@@ -104,23 +92,9 @@ def _is_missing(cell: Any) -> bool:
     return cell is None or (isinstance(cell, float) and math.isnan(cell))
 
 
-def doubles(cells: Any) -> Tensor:
-    """Returns numbers as float64 on the CPU, whatever they are given as and wherever they are.
-
-    Raises:
-        TypeError, ValueError, RuntimeError: if they are no numbers.
-    """
-    if isinstance(cells, Tensor):
-        return cells.detach().cpu().double()
-    return torch.from_numpy(np.array(cells, dtype=np.float64))
-
-
 def _numbers(name: str, column: Any) -> Tensor:
     cells = column if hasattr(column, "__array__") else [*column]
-    try:
-        return doubles(cells).reshape(len(cells), -1)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ArgumentError(f"{name}={shown(column)}: must be numbers or texts") from error
+    return torch.from_numpy(as_numbers(name, cells)).reshape(len(cells), -1)
 
 
 def ranks(table: Tensor) -> Tensor:

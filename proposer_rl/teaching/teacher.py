@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
+from secrets import token_hex
 from threading import RLock
 from typing import Any, Literal, SupportsIndex
 
@@ -24,23 +25,19 @@ from proposer_rl.curricula.ledger import OUT, OVER, RETURNED, Block, Ledger
 from proposer_rl.models import check_torch_defaults
 from proposer_rl.recipes import Recipe
 from proposer_rl.runs.folder import storage
-from proposer_rl.settings import ArgumentError, Count, checked, shown, whole
+from proposer_rl.settings import ArgumentError, Count, checked, whole
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels, Task
 from proposer_rl.teaching.abilities import adapted
 from proposer_rl.teaching.identity import of_levels, require_same
 from proposer_rl.teaching.making import make_curriculum
+from proposer_rl.teaching.numbers import as_ids
 from proposer_rl.teaching.remote import TeacherClient, TeacherServer
 from proposer_rl.teaching.results import (
-    COUNTS,
     LEVEL_ID,
     RESULTS,
-    argument,
-    as_array,
-    as_device,
-    as_ids,
-    as_number,
     as_outcome,
+    as_result,
     by_name,
     ended,
     outcome_of_rollout,
@@ -73,17 +70,18 @@ class Teacher:
         space: :class:`~proposer_rl.teaching.Parameters`, :class:`~proposer_rl.teaching.Items`,
             :class:`~proposer_rl.teaching.LevelGenerator`, or a task.
         seed: of every random draw.
-        students: number K of students that train side by side, each with levels of its own. All
-            levels and results then have a dimension [K] before the others.
         device: where levels and tickets are given.
         filter: of the proposed levels, as of :func:`proposer_rl.train`.
         block: tickets that the curriculum proposes at once; fewer where episodes are few.
         success: what in a rollout is a success where it has no such entry: ``"terminated"``,
             ``"truncated"``, or a function of its ``next``; None where termination may be a failure.
         student: what the curriculum may ask of; None for one that can do what ``can`` says.
-        can: functions by their names, as of :class:`~proposer_rl.curricula.Student`. Where there is
-            one student, ``performance``, ``exact_performance``, ``optimal_return`` and ``play`` are
-            called with levels [n] as :meth:`propose` gives them.
+        can: functions by their names, as of :class:`~proposer_rl.curricula.Student`, of which
+            ``performance``, ``exact_performance``, ``optimal_return`` and ``play`` are called with
+            levels [n] as :meth:`propose` gives them.
+
+    Attributes:
+        id: a text that no other teacher has; a checkpoint keeps it, and each line of a log.
 
     Raises:
         ArgumentError: naming the argument.
@@ -112,7 +110,6 @@ class Teacher:
         space: LevelSpace | Task,
         *,
         seed: SupportsIndex = 0,
-        students: Count = 1,
         device: str | torch.device = "cpu",
         filter: Mapping[str, Any] | str | None = None,
         block: Count = 384,
@@ -121,20 +118,15 @@ class Teacher:
         **can: Any,
     ) -> None:
         check_torch_defaults()
-        self.space, self.device, self.block = space, as_device(device), block
-        self._seeds = [whole("seed", seed) + number for number in range(students)]
-        self.curriculum, self._made_of = make_curriculum(curriculum, space, filter, self._seeds)
-        if not isinstance(student, Student | None):
-            raise ArgumentError(f"student={shown(student)}: must be a Student or None")
+        self.space, self.device, self.block = space, torch.empty(0, device=device).device, block
+        self.id = token_hex(4)
+        self._seed = whole("seed", seed)
+        self.curriculum, self._made_of = make_curriculum(curriculum, space, filter, [self._seed])
         if student is not None and can:
             raise ArgumentError(f"{next(iter(can))}: give it to the student, which is asked alone")
-        self._alone = students == 1
         given = getattr(space, "given", lambda levels: levels)
         self.student = student or Student(
-            **{
-                name: adapted(name, one, given, self.device) if self._alone else one
-                for name, one in can.items()
-            }
+            **{name: adapted(name, one, given, self.device) for name, one in can.items()}
         )
         named = curriculum if isinstance(curriculum, str) else getattr(curriculum, "name", None)
         require(self.student, self.curriculum.needs, named or type(self.curriculum).__name__)
@@ -143,7 +135,7 @@ class Teacher:
         self._ledger, self._tally = Ledger(dict.fromkeys(RESULTS, float)), Tally(space)
         self._scored: bool | None = None  # whether results come with a score; None before any
         self._succeeded: set[bool] = set()  # whether they came with a success, or without
-        self._proposals = 0
+        self._proposals = self._levels_told = 0  # the latter up to the last log()
         self._whole: list[int] = []  # first tickets of what propose() has given
         self._block, self._counted = None, 0
         self._use(None, 0)
@@ -152,17 +144,12 @@ class Teacher:
         self._server: TeacherServer | None = None
 
     @property
-    def students(self) -> int:
-        """The number K."""
-        return len(self._seeds)
-
-    @property
     def reads(self) -> tuple[str, ...]:
         """Names of what results must have beside the return: ``success``, ``rollout``."""
         return self.curriculum.reads
 
     def propose(self, n: SupportsIndex) -> Any:
-        """Returns levels [n] ([K, n] of several students) to be observed together."""
+        """Returns levels [n] to be observed together."""
         with self._here():
             block = self._next(whole("n", n, 1))
             block.state[:] = OUT
@@ -177,8 +164,7 @@ class Teacher:
             n: None for one level, as Python's numbers where the space has such; else so many.
 
         Returns:
-            A ticket and a level; or tickets int64 [n] and levels [n], on the teacher's device. One
-            ticket holds the levels of all K students.
+            A ticket and a level; or tickets int64 [n] and levels [n], on the teacher's device.
         """
         with self._here():
             if n is None:
@@ -194,11 +180,11 @@ class Teacher:
                 ids.append(torch.arange(start, end, device=self.device))
                 if self._moved is None:
                     self._moved = self._levels(block)
-                levels.append(self._moved[which] if self._alone else self._moved[:, which])
+                levels.append(self._moved[which])
                 left -= end - start
             if len(ids) == 1:
                 return ids[0], levels[0]
-            return torch.cat(ids), torch.cat(levels, 0 if self._alone else 1)
+            return torch.cat(ids), torch.cat(levels)
 
     def tell(
         self,
@@ -215,7 +201,7 @@ class Teacher:
         Args:
             ids: a ticket, or tickets [n] in any order.
             return_: undiscounted, of an episode on each level or a mean of several: a number, or
-                numbers [n] ([K, n] of several students; [K] for one ticket).
+                numbers [n].
             success: whether, or of how many of them; from 0 to 1. It counts where all levels that
                 are observed together have one.
             score: how much there is to learn on the level, where the loop says so itself, such as
@@ -232,19 +218,15 @@ class Teacher:
         pairs = zip(RESULTS, given, strict=True)
         results = {n: one for n, one in pairs if one is not None or n == "return"}
         with self._here():
-            if "rollout" in self.reads:
-                raise ArgumentError("tell: this curriculum reads rollouts; use observe(rollout)")
-            if return_ is None:
-                raise ArgumentError("return_: missing: of each level, such as its success")
-            if success is None:
-                self._require_success(False, "tell it with success=")
-            if self._alone and type(ids) is int:
-                numbers = {name: as_number(name, value) for name, value in results.items()}
+            self._require("rollout", False, "use observe(rollout)")
+            self._require("success", success is not None, "tell it with success=")
+            if type(ids) is int:
+                numbers = {name: as_result(name, value, ()) for name, value in results.items()}
                 self._check_score(results)
                 self._ledger.tell_one(ids, numbers)
                 self._tally.returned(1, numbers["return"], numbers.get("success"))
             else:
-                self._tell(as_ids(ids), results)
+                self._tell(as_ids("ids", ids), results)
             self._note_known(results)
 
     def predicted(self, ids: Any) -> NDArray[np.float64] | None:
@@ -254,24 +236,24 @@ class Teacher:
             ids: tickets [n] that are out.
 
         Returns:
-            [n] ([K, n] of several students); None if it expects nothing.
+            [n]; None if it expects nothing.
 
         Raises:
             ArgumentError: for a ticket that is not out.
         """
         with self._here():
-            tickets = as_ids(ids)
-            found = np.full((self.students, len(tickets)), np.nan)
+            tickets = as_ids("ids", ids)
+            found = np.full(len(tickets), np.nan)
             for block, which, place in self._ledger.find(tickets):
                 if "predicted" not in block.batch.notes.keys():
                     return None
-                found[:, which] = block.batch.notes["predicted"][:, place]
-            return found[0] if self._alone else found
+                found[which] = block.batch.notes["predicted"][0, place]
+            return found
 
     def done_with(self, ids: Any) -> NDArray[np.bool_]:
         """Returns of which tickets [n] the results have been told, or that were dropped, [n]."""
         with self._here():
-            return np.isin(self._ledger.states(as_ids(ids)), (RETURNED, OVER))
+            return np.isin(self._ledger.states(as_ids("ids", ids)), (RETURNED, OVER))
 
     def drop(self, ids: Any = None) -> None:
         """Gives up levels of which no results will come, as of episodes that were cut off.
@@ -286,7 +268,7 @@ class Teacher:
                 self._ledger.drop_all()
                 self._whole.clear()
             else:
-                tickets = as_ids(ids)
+                tickets = as_ids("ids", ids)
                 going = tickets[self._ledger.states(tickets) != OVER]
                 self._ledger.drop(self._ledger.find(going))
                 dropped = len(going)
@@ -312,21 +294,20 @@ class Teacher:
             if isinstance(outcome, TensorDictBase) and "next" in outcome.keys():
                 kept = self._kept
                 if kept is not None:  # of episodes that were not cut off since
-                    states = self._ledger.states(as_ids(kept[LEVEL_ID].reshape(-1)))
+                    states = self._ledger.states(as_ids("ids", kept[LEVEL_ID].reshape(-1)))
                     kept = kept[torch.from_numpy(states == OUT).to(kept[LEVEL_ID].device)]
                 tickets, whole, left = ended(outcome, kept)
                 if len(tickets):
                     self._observe_rollout(tickets, whole)
                 self._kept = left
                 return
-            tickets = self._proposed() if ids is None else as_ids(ids)
+            tickets = self._proposed() if ids is None else as_ids("ids", ids)
             results = by_name(outcome)
             if "rollout" in results:
                 self._observe_rollout(tickets, results["rollout"])
             else:
-                if "rollout" in self.reads:
-                    raise ArgumentError("outcome: has no rollout, which this curriculum reads")
-                self._require_success("success" in results, "put it into the outcome")
+                for name in ("rollout", "success"):
+                    self._require(name, name in results, "put it into the outcome")
                 self._tell(tickets, results)
                 self._note_known(results)
             if ids is None:
@@ -343,7 +324,9 @@ class Teacher:
         no curriculum.
 
         Args:
-            file: JSON Lines to which it is added as a line, without levels, for ``bin/report``.
+            file: JSON Lines to which it is added as a line, without levels, with the teacher's
+                ``id`` as ``teacher``, and with ``levels_told`` since it began, for ``bin/report``,
+                which draws each teacher by itself, and what goes on from an earlier state.
 
         Raises:
             StorageError: if the file cannot be written.
@@ -351,8 +334,10 @@ class Teacher:
         with self._here():
             self._count()
             record = {**self.curriculum.log(), **self._tally.read(self._ledger.out)}
+            self._levels_told += record["told"]
             if file is not None:
-                kept = {name: value for name, value in record.items() if name != "levels"}
+                kept = {"teacher": self.id, "levels_told": self._levels_told, **record}
+                kept.pop("levels", None)
                 with storage(Path(file)), open(file, "a", encoding="utf-8") as lines:
                     lines.write(json.dumps(kept) + "\n")
             return record
@@ -364,7 +349,8 @@ class Teacher:
             kept = self._kept
             return {
                 "of": self._of,
-                "students": self.students,
+                "id": self.id,
+                "levels_told": self._levels_told,
                 "curriculum": self.curriculum.state_dict(),
                 "ledger": self._ledger.state_dict(),
                 "scored": self._scored,
@@ -382,16 +368,12 @@ class Teacher:
         """Puts back what :meth:`state_dict` returned, on whichever device its tensors are.
 
         Raises:
-            ArgumentError: if it is none, of another space, curriculum, setting of it or number of
-                students, naming what differs, or tickets are out, as of environments that have
-                begun; then nothing has changed.
+            ArgumentError: if it is of another space, curriculum or setting of it, naming what
+                differs, or tickets are out, as of environments that have begun; then nothing has
+                changed.
         """
         with self._here():
-            if not isinstance(state, Mapping) or not {"of", "ledger"} <= state.keys():
-                raise ArgumentError(f"state={shown(state)}: must be of Teacher.state_dict()")
             state = tree_map_only(Tensor, Tensor.cpu, state)
-            if state["students"] != self.students:
-                raise ArgumentError(f"state: of {state['students']} students, not {self.students}")
             for what, now in self._of.items():
                 require_same(what, state["of"][what], now)
             if self._ledger.out:
@@ -400,6 +382,7 @@ class Teacher:
                     "load it before collectors and environments begin, or drop() them, and reset "
                     "what plays them"
                 )
+            self.id, self._levels_told = state["id"], state["levels_told"]
             self.curriculum.load_state_dict(state["curriculum"])
             self._ledger.load_state_dict(state["ledger"], self._like)
             self._scored = state["scored"]
@@ -421,7 +404,7 @@ class Teacher:
         """
         with self._here():
             if number:
-                self._seeds = [seed + number for seed in self._seeds]
+                self._seed += number
                 if self._block is not None:
                     self._block.state[:, self._at - self._block.start :] = OVER
                 self._use(None, 0)
@@ -465,8 +448,7 @@ class Teacher:
         self._at += 1
         block.state[:, ticket - block.start] = OUT
         if not self._rows:
-            each = [self._rows_of(levels) for levels in moved(block.batch.levels, CPU).clone()]
-            self._rows = each[0] if self._alone else [*zip(*each, strict=True)]
+            self._rows = self._rows_of(moved(block.batch.levels, CPU)[0].clone())
         return ticket, self._rows[ticket - block.start]
 
     def _current(self, left: int) -> Block:
@@ -497,47 +479,43 @@ class Teacher:
         check_torch_defaults()
         for batch, results in self._ledger.take():
             self.curriculum.observe(self.student, batch, as_outcome(results))
-        streams = [Streams(seed, "update", self._proposals) for seed in self._seeds]
-        batch = self.curriculum.propose(self.student, count, streams)
+        streams = Streams(self._seed, "update", self._proposals)
+        batch = self.curriculum.propose(self.student, count, [streams])
         given = list(batch.notes.batch_size) if isinstance(batch, Batch) else type(batch).__name__
-        if given != [self.students, count]:
+        if given != [1, count]:
             raise ArgumentError(
                 f"curriculum={type(self.curriculum).__name__}: must propose a Batch of levels "
-                f"{[self.students, count]}, got {given}"
+                f"{[1, count]}, got {given}"
             )
         self._proposals += 1
         return self._ledger.add(batch)
 
     def _levels(self, block: Block) -> Any:
         """Returns the levels of a block as the loop gets them, which may change them."""
-        levels = moved(block.batch.levels, self.device).clone()
-        return self._given(levels[0] if self._alone else levels)
+        return self._given(moved(block.batch.levels, self.device)[0].clone())
 
     def _tell(self, ids: NDArray[np.int64], results: Mapping[str, Any]) -> None:
-        shape = (len(ids),) if self._alone else (self.students, len(ids))
         arrays = {
-            name: as_array(argument(name), value, shape, name in COUNTS).reshape(self.students, -1)
-            for name, value in results.items()
+            name: as_result(name, value, (len(ids),))[np.newaxis] for name, value in results.items()
         }
         self._check_score(results)
         self._ledger.tell(self._ledger.find(ids), arrays)
         self._tally.returned(len(ids), arrays["return"], arrays.get("success"))
 
     def _observe_rollout(self, ids: NDArray[np.int64], rollout: TensorDictBase) -> None:
-        """Observes a rollout [K, n, T], or [n, T] of one student, with a row for each ticket."""
-        if self._alone and rollout.ndim < 3:
-            rollout = rollout.unsqueeze(0)
-        if tuple(rollout.batch_size[:2]) != (self.students, len(ids)):
+        """Observes a rollout [n, T] or [1, n, T], with a row for each ticket."""
+        rollout = rollout.unsqueeze(0) if rollout.ndim < 3 else rollout
+        if tuple(rollout.batch_size[:2]) != (1, len(ids)):
             raise ArgumentError(
-                f"rollout: has shape {list(rollout.batch_size)}, but must have one row for each of "
-                f"{len(ids)} levels of {self.students} student(s)"
+                f"rollout: has shape {list(rollout.batch_size)}, but must have a row for each of "
+                f"{len(ids)} levels"
             )
         parts = self._ledger.find(ids)
         outcome = outcome_of_rollout(rollout, self._success)
         known = "success" in outcome.keys()
-        self._require_success(known, "give Teacher(success=...), or the rollout a next success")
+        self._require("success", known, "give Teacher(success=...), or the rollout a next success")
         numbers = {
-            name: as_array(name, outcome[name], tuple(outcome.batch_size))
+            name: as_result(name, outcome[name][0], (len(ids),))
             for name in (("return", "success") if known else ("return",))
         }
         for block, which, place in parts:
@@ -565,9 +543,9 @@ class Teacher:
                     stacklevel=3,
                 )
 
-    def _require_success(self, known: bool, how: str) -> None:
-        if "success" in self.reads and not known:
-            raise ArgumentError(f"success: missing: this curriculum reads it; {how}")
+    def _require(self, name: str, known: bool, how: str) -> None:
+        if name in self.reads and not known:
+            raise ArgumentError(f"{name}: missing: this curriculum reads it; {how}")
 
     def _proposed(self) -> NDArray[np.int64]:
         """Returns the tickets of the one batch that is out."""

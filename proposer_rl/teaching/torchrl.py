@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -19,7 +18,7 @@ from torchrl.envs import (
     VecGymEnvTransform,
 )
 
-from proposer_rl.settings import ArgumentError, shown
+from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching.remote import TeacherClient
 from proposer_rl.teaching.results import LEVEL_ID
 from proposer_rl.teaching.teacher import Success, Teacher
@@ -30,6 +29,7 @@ NONE = -1  # the identity of no level
 class _Played:
     """The levels [n] that the environments of a batch play, and what has come of them so far."""
 
+    owners: Sequence[object] = ()  # those of the transforms there were, the present one last
     ids: Tensor  # int64 [n]
     out: Tensor  # whether they still are, bool [n]
     returns: Tensor
@@ -39,12 +39,8 @@ class _Played:
     levels: Any = None  # [n], in one row
     asked = False
 
-
-class _Playing(WeakKeyDictionary[Any, _Played]):
-    """What an environment plays, by teacher; its copy in another process plays nothing yet."""
-
     def __reduce__(self) -> Any:
-        return _Playing, ()
+        return _Played, ()  # a copy in another process plays nothing yet
 
 
 class LevelTransform(Transform):
@@ -54,12 +50,15 @@ class LevelTransform(Transform):
     level that is played. An episode goes to the level that it began on, in whichever rollout it
     ends. One that a full reset cuts off counts for nothing.
 
+    An environment has one ``LevelTransform``: a second one around it is refused, and one around its
+    ``base_env`` takes the place of the first.
+
     It works in a collector with and without ``reset_at_each_iter``, and with ``teacher.client()``
     in environments of other processes. Put it behind transforms that end episodes and before those
     that change rewards.
 
     Args:
-        teacher: of one student; in another process than its own, its client.
+        teacher: in another process than its own, its client.
         set_level: ``set_level(env, levels)`` makes the environment, without transforms, play levels
             [*B] from its next reset on. Of those that go on the levels are as before.
         success: see :class:`Teacher`, or another entry of ``next``; None for its entry
@@ -72,9 +71,10 @@ class LevelTransform(Transform):
             rollout alone, then needs ``reset_at_each_iter``.
 
     Raises:
-        ArgumentError: if the teacher is of several students, or reads rollouts while ``tell`` is
-            true; at the first reset, if the environment has no such reward or success, resets
-            itself, or is one of several that levels do not get into from outside.
+        ArgumentError: if the teacher reads rollouts while ``tell`` is true; at the first reset, if
+            the environment has a ``LevelTransform`` or no such reward or success, resets itself, or
+            is one of several that levels do not get into from outside; later, if another
+            ``LevelTransform`` has taken this one's place.
     """
 
     def __init__(
@@ -88,30 +88,33 @@ class LevelTransform(Transform):
         tell: bool = True,
     ) -> None:
         super().__init__(in_keys=[], out_keys=[LEVEL_ID])
-        if teacher.students != 1:
-            raise ArgumentError(f"teacher: of {teacher.students} students, but must be of one")
-        if not callable(set_level):
-            raise ArgumentError(
-                f"set_level={shown(set_level)}: must be a function of env and levels"
-            )
-        if not (success is None or isinstance(success, str | tuple) or callable(success)):
-            raise ArgumentError(
-                f"success={success!r}: must be an entry of next, a function or None"
-            )
         if tell and "rollout" in teacher.reads:
             raise ArgumentError(
                 "tell=True: this curriculum reads rollouts; give tell=False, and each rollout to "
                 "teacher.observe"
             )
-        self._teacher, self._set_level = teacher, set_level
+        self._teacher, self._set_level, self._own = teacher, set_level, object()
         self._rule, self._once, self._reward, self._tells = success, once, reward, tell
 
     @property
     def _now(self) -> _Played:
         # The environment's: of a transform that another one steps through TorchRL makes a clone.
-        # Weak keys: another teacher may get the id of one that is gone.
-        played: _Playing = vars(self.parent.base_env).setdefault("_played", _Playing())
-        return played.setdefault(self._teacher, _Played())
+        place = vars(self.parent.base_env)
+        played: _Played = place.get("_played", _Played())
+        if self._own not in played.owners[-1:]:
+            if LEVEL_ID in self.parent.observation_spec.keys():
+                raise ArgumentError(
+                    "env: has a LevelTransform already, as where a cell is run twice: each would "
+                    "set a level of its own; make the environment anew, or give env.base_env"
+                )
+            if self._own in played.owners:
+                raise ArgumentError(
+                    "env: another LevelTransform has been put around it since; use that"
+                )
+            before, played = played, _Played()
+            played.owners = [*before.owners, self._own]
+            place["_played"] = played
+        return played
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Adds ``level_id``."""
@@ -219,16 +222,13 @@ class LevelTransform(Transform):
 
     def _of_each(self, name: str, rule: Any, after: TensorDictBase) -> Tensor:
         """Returns one number of each environment, [n], by an entry or a function."""
-        how = "it must be one number for each environment, an entry or a function of next"
-        entry = rule(after) if callable(rule) else after.get(rule, None)
-        if entry is None:
-            there = ", ".join(
-                key if isinstance(key, str) else ".".join(key) for key in after.keys(True, True)
-            )
-            raise ArgumentError(f"{name}={rule!r}: no entry of next, which has {there}; {how}")
+        entry = rule(after) if callable(rule) else after[rule]
         batch = self.parent.batch_size
         if entry.numel() != batch.numel() or entry.shape[: len(batch)] != batch:
-            raise ArgumentError(f"{name}: has the shape {[*entry.shape]}, not {[*batch, 1]}; {how}")
+            raise ArgumentError(
+                f"{name}: has the shape {[*entry.shape]}, not {[*batch, 1]}; it must be "
+                "one number for each environment, an entry or a function of next"
+            )
         return entry.reshape(-1)
 
     def _success(self, after: TensorDictBase) -> Any:

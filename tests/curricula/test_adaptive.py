@@ -279,40 +279,18 @@ def test_an_episode_that_went_wrong_does_not_make_all_others_look_alike(wrong: f
     assert torch.corrcoef(torch.stack([p, x]))[0, 1] > 0.9
 
 
-def test_inputs_that_are_no_numbers_are_refused() -> None:
-    curriculum = AdaptiveMixture(
-        LINE, LINE.target, lambda levels: torch.full((*levels.shape, 2), math.nan)
-    )
-    with pytest.raises(ValueError, match=r"^inputs: 2 of 2 numbers are not finite$"):
-        curriculum.propose(Student(), 4, [Streams(0)])
-
-
 def draw(n: int, generator: torch.Generator) -> Tensor:
     return torch.rand(n, 2, generator=generator)
 
 
-@pytest.mark.parametrize(
-    ("features", "message"),
-    [
-        (lambda levels: levels[:, 0], r"^features=\[1\]: must give a row .* each of 1 levels$"),
-        (lambda levels: levels / 0, r"^features=\[\[inf, inf\]\]: must give finite float32$"),
-        (lambda levels: levels[:1].repeat(2, 1), r"^features=\[2, 2\]: .* of 1 levels$"),
-        (lambda levels: [["a"]], r"^features=.*: must be numbers \[N, D\]$"),
-        (
-            lambda levels: levels[:, : 1 + (len(levels) > 1)],
-            r"^features=\[.*, 2\]: must give rows of one length, first 1$",
-        ),
-    ],
-)
 @pytest.mark.parametrize("made", [False, True])
-def test_features_that_are_none_are_refused_in_one_line(
-    features: Any, message: str, made: bool
-) -> None:
-    space: Any = prl.LevelGenerator(draw, features=features)
+def test_inputs_that_are_no_numbers_are_refused(made: bool) -> None:
+    space: Any = prl.LevelGenerator(draw, features=lambda levels: levels / 0)
     if made:
         make = lambda values, generator: draw(len(values), generator)  # noqa: E731
+        features = lambda levels: levels / 0  # noqa: E731
         space = prl.MadeLevels({"x": (0.0, 1.0)}, make, features=features)
-    with pytest.raises(ArgumentError, match=message):
+    with pytest.raises(ValueError, match=r"^inputs: \d+ of \d+ numbers are not finite$"):
         prl.Teacher("adaptive_mixture", space).propose(8)
 
 

@@ -190,7 +190,7 @@ def test_the_order_in_which_parts_come_back_has_no_effect(name: str) -> None:
     assert same(*({**each, "direction": None} for each in (state, other_state)))
 
 
-LEARNING = ["plr", "accel", "progress of episodes", "alp_gmm", "first order, sampled", "paired"]
+LEARNING = ["plr", "accel", "progress of episodes", "alp_gmm", "paired"]
 LEARNING += ["adr", "terrain_levels", "spdl", "adaptive_mixture"]
 
 
@@ -231,15 +231,9 @@ def test_it_asks_for_what_it_says_whatever_the_size_and_tells_what_came_back(mak
 
 
 WRONG: dict[str, tuple[Callable[[Batch, TensorDict], tuple[Batch, TensorDictBase]], str]] = {
-    "too few": (lambda b, o: (b, o[:, :2]), "the outcome has shape"),
     "not finite": (
         lambda b, o: (b, o.copy().set("return", o["return"] * torch.inf)),
         "the outcome's return is not finite",
-    ),
-    "no return": (lambda b, o: (b, o.exclude("return")), "the outcome has no return"),
-    "another's": (
-        lambda b, o: (Batch(b.levels, TensorDict({}, b.notes.batch_size)), o),
-        "the batch is of another curriculum",
     ),
     "not proposed": (
         lambda b, o: (Batch(b.levels, b.notes.clone().set("number", b.notes["number"] + 9)), o),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import warnings
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,13 +9,11 @@ from typing import Any
 import pytest
 import torch
 
-from proposer_rl import curricula as recipes
 from proposer_rl.cli.build import build, parts
 from proposer_rl.curricula import Filtered, Modelled, SamplingCurriculum, Scorer, Student
 from proposer_rl.curricula.outcome_model import OutcomeModel
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.process import StopSignals
-from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import space_features
 from proposer_rl.tasks.mazes.task import MazeTask
@@ -137,10 +133,6 @@ def test_it_takes_a_student_of_whom_nothing_is_known_but_what_it_did() -> None:
     student = Scripted(torch.tensor([[0.0, 1.0]]))
     curriculum = scripted_filter(student)
     assert curriculum.needs == ()
-    with pytest.raises(ValueError, match="labels=success: the outcome has no success"):
-        other = scripted_filter(student, labels="success")
-        batch = other.propose(Student(), 3, [Streams(0)])
-        other.observe(Student(), batch, reached(torch.zeros(1, 3)).exclude("success"))
     batch = curriculum.propose(Student(), 3, [Streams(0)])
     curriculum.observe(Student(), batch, reached(torch.zeros(1, 3)).exclude("success"))
     curriculum.propose(Student(), 3, [Streams(1)])
@@ -218,35 +210,3 @@ def test_a_maze_without_a_way_is_no_easy_one() -> None:
     level = TASK.space.generate(torch.tensor([[0]]), [Streams(0).generator()])[0, 0]
     level.walls[:] = True
     assert TASK.space.locate(level)[1] > 1
-
-
-LINE = Parameters({"x": (0.0, 1.0)}, bins=4)
-Q = torch.rand(160, generator=torch.Generator().manual_seed(0)) + 0.1
-LITTLE: dict[str, tuple[dict[str, Any], Any, Any, str | None]] = {
-    "dense": ({}, Q, None, "100%|99% of the first returns are that, so that the labels say nearly"),
-    "dense, told": ({}, Q, Q < 0.5, "not the success that was told, which labels=success reads"),
-    "read": ({"labels": "success"}, Q, Q < 0.5, None),
-    "alike": ({}, (Q < 0.5).float(), Q < 0.5, None),
-    "sparse": ({}, (Q < 0.5).float(), None, None),
-    "nearly all succeed": ({}, (Q > 0.13).float(), Q > 0.13, None),
-}
-
-
-@pytest.mark.parametrize("what", LITTLE)
-def test_labels_that_say_little_are_warned_of_once(what: str) -> None:
-    settings, returns, success, message = LITTLE[what]
-    curriculum = Modelled(SamplingCurriculum(LINE), LINE.features, **settings)
-    teacher = Teacher(curriculum, LINE)
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        for _ in range(3):
-            ids, _ = teacher.ask(160)
-            teacher.tell(ids, returns, success)
-            teacher.propose(1)
-    assert len(said) == (message is not None)
-    assert message is None or re.search(message, str(said[0].message))
-
-
-def test_a_recipe_is_no_curriculum_that_something_is_made_of() -> None:
-    with pytest.raises(ArgumentError, match=r"curriculum=Recipe.*plr.*: must be a Curriculum"):
-        Modelled(recipes.plr(), LINE.features)  # type: ignore[arg-type]

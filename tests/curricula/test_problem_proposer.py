@@ -15,7 +15,6 @@ from proposer_rl.curricula import (
     Curriculum,
     Filtered,
     FirstOrderProposer,
-    Student,
 )
 from proposer_rl.learning import DivergedError, PPOSettings
 from proposer_rl.models import (
@@ -148,9 +147,3 @@ def test_a_proposer_that_has_not_begun_resumes_too() -> None:
     assert one.log() == {}
     levels = [c.propose(taught(task), P, [Streams(0)]).levels for c in (one, other)]
     assert torch.equal(*levels)
-
-
-def test_several_solvers_are_refused() -> None:
-    task = Seen(2, WANTED)
-    with pytest.raises(ValueError, match="a Proposer learns from one Solver, got 2"):
-        proposer(task).propose(Student(), P, [Streams(0), Streams(1)])

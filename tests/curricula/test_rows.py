@@ -93,7 +93,6 @@ def test_rows_move_as_of_one_robot_after_another() -> None:
     ("space", "options", "message"),
     [
         (SPACE, {"row": "level"}, "^row=level: unknown; there are: speed, row$"),
-        (SPACE, {"lower": 0.6}, "^lower=0.6: must be at most upper=0.5$"),
         (SPACE, {"start": -1}, "^start=-1: input should be"),
         (
             prl.Parameters({"row": (0.0, 1.0)}, bins=1),
@@ -107,11 +106,7 @@ def test_what_cannot_be_is_named(space: Any, options: dict[str, Any], message: s
         RowsCurriculum(space, **options)
 
 
-def test_of_whole_numbers_that_share_a_row_there_is_a_warning() -> None:
-    space = prl.Parameters({"row": range(10)})
-    with pytest.warns(UserWarning, match=r"^row: 10 whole numbers in 8 rows; bins={'row': 10} "):
-        RowsCurriculum(space)
-    # The first axis, unless one is called so.
+def test_rows_are_the_first_axis_unless_one_is_called_so() -> None:
     curriculum = RowsCurriculum(prl.Parameters({"a": (0.0, 1.0), "b": (0.0, 1.0)}, bins=4), start=0)
     levels = curriculum.propose(Student(), 64, [Streams(0)]).levels
     assert levels["a"].max() < 0.25 and levels["b"].max() > 0.75

@@ -109,6 +109,29 @@ def test_a_loop_that_goes_on_from_an_earlier_state_is_another_curve(tmp_path: Pa
     assert "earlier state" in notes[0]
 
 
+def test_a_teacher_whose_state_is_put_back_is_another_part_of_its_curve(tmp_path: Path) -> None:
+    """A later process that goes on from the last state is not."""
+    file, space = tmp_path / "x.jsonl", prl.Parameters({"a": (0.0, 1.0)})
+
+    def go_on(teacher: prl.Teacher, lines: int) -> dict:
+        for _ in range(lines):
+            ids, _levels = teacher.ask(8)
+            teacher.tell(ids, torch.zeros(8))
+            teacher.log(file)
+        return teacher.state_dict()
+
+    early = go_on(first := prl.Teacher("plr", space, block=8), 2)
+    last = go_on(first, 1)
+    for state in (last, early):
+        again = prl.Teacher("plr", space, block=8)
+        again.load_state_dict(state)
+        go_on(again, 2)
+    assert {label: log.x.tolist() for label, log in read_curves([file]).logs.items()} == {
+        "x": [8, 16, 24, 32, 40],
+        "x, part 2, from 16 levels on": [24, 32],
+    }
+
+
 def test_shares_of_batches_are_entries_by_name(tmp_path: Path) -> None:
     rows = [{"told": 4, "drawn": {}, "shares": shares} for shares in ({"way": [0.2, 0.4]}, None)]
     write_jsonl(tmp_path / "x.jsonl", rows)

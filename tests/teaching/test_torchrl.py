@@ -29,7 +29,7 @@ from torchrl.envs.utils import RandomPolicy, check_env_specs
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
 from tests.host_reads import CountedReads
-from tests.teaching.counting import ITEMS, LevelsEnv, check, counted, length, seen, set_level
+from tests.teaching.counting import LevelsEnv, check, counted, length, seen, set_level
 
 LEVELS = 4
 
@@ -217,15 +217,36 @@ def test_environments_in_other_processes_have_one_teacher(monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: taught(prl.Teacher("domain_randomization", ITEMS, students=2)), "teacher: of 2"),
         (lambda: taught(counted("rollout")), "tell=True: this curriculum"),
-        (lambda: prl.LevelTransform(counted(), {"a": "b"}), "set_level={'a': 'b'}: must be a func"),
-        (lambda: prl.LevelTransform(counted(), print, success=1), "success=1: must be an entry of"),
     ],
 )
 def test_what_cannot_be_taught_is_refused(make: Any, message: str) -> None:
     with pytest.raises(ArgumentError, match=message):
         make()
+
+
+BETWEEN = [lambda env: env, lambda env: TransformedEnv(env, StepCounter())]
+
+
+@pytest.mark.filterwarnings("ignore:Nested TransformedEnvs")
+@pytest.mark.parametrize("between", BETWEEN)
+@pytest.mark.parametrize("unwrapped", [True, False])
+@pytest.mark.parametrize("same", [True, False])
+def test_an_environment_has_one_teacher(same: bool, unwrapped: bool, between: Any) -> None:
+    """As where a notebook's cell is run twice; what takes the place of the first goes on alone."""
+    teacher = counted()
+    first = taught(teacher)
+    transform = prl.LevelTransform(teacher if same else counted(), set_level)
+    twice = TransformedEnv(between(first), transform, auto_unwrap=unwrapped)
+    with pytest.raises(ArgumentError, match=r"^env: has a LevelTransform already"):
+        twice.rollout(3)
+    again = taught(counted(), count=None)
+    anew = TransformedEnv(again.base_env, prl.LevelTransform(other := counted(), set_level))
+    again.rollout(3)
+    anew.rollout(30, break_when_any_done=False)
+    check(seen(other))
+    with pytest.raises(ArgumentError, match=r"^env: another LevelTransform has been put around"):
+        again.rollout(3)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -269,17 +290,10 @@ AGENTS, OBJECTIVES = (("agents", "reward"), (2, 1)), ("reward", (2,))
     [
         (
             partial(Several, *AGENTS),
-            {},
-            "reward='reward': no entry of next, .*agents.reward",
-        ),
-        (
-            partial(Several, *AGENTS),
             {"reward": ("agents", "reward")},
             r"reward: has the shape \[3, 2, 1\], not \[3, 1\]; it must be one number for each",
         ),
         (partial(Several, *OBJECTIVES), {}, r"reward: has the shape \[3, 2\], not \[3, 1\]"),
-        (LevelsEnv, {"success": "won"}, "success='won': no entry of next, which has .*success"),
-        (LevelsEnv, {"success": "observatio"}, "success='observatio': no entry"),
         (partial(SerialEnv, 2, LevelsEnv), {}, "env: levels .* of SerialEnv from outside"),
         (
             partial(ParallelEnv, 2, LevelsEnv),

@@ -82,4 +82,4 @@ def test_what_is_no_environment_is_refused(
 ) -> None:
     assert train(*WINDY, "+method=target", word, "hydra.run.dir=run") == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert said in line and not Path("run").exists()
+    assert said in line and not Path("run", "run.json").exists()

@@ -92,4 +92,4 @@ def test_what_no_mass_can_be_before_is_refused(
 ) -> None:
     assert train(*TINY, "+method=target", word, "hydra.run.dir=run") == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert said in line and not Path("run").exists()
+    assert said in line and not Path("run", "run.json").exists()
