@@ -13,7 +13,6 @@ from proposer_rl.curricula import (
     ProposerTrainer,
     SamplingCurriculum,
     Schedule,
-    Student,
     TaskStudent,
 )
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, PPOSettings, agent_weights, load_agent
@@ -80,15 +79,6 @@ def weights(curriculum: ProposerCurriculum) -> TensorDict:
     return curriculum.trainer.learner.snapshot()
 
 
-def test_a_copys_levels_depend_on_its_stream_alone() -> None:
-    curriculum = SamplingCurriculum(SPACE)
-    both = curriculum.propose(Student(), P, [Streams(0), Streams(1)])
-    alone = curriculum.propose(Student(), P, [Streams(1)])
-    assert both.levels.batch_size == (2, P)
-    assert (both.levels[1] == alone.levels[0]).all()
-    assert not (both.levels[0] == both.levels[1]).all()
-
-
 def test_a_proposer_may_begin_within_a_cycle() -> None:
     stages = [SamplingCurriculum(SPACE), proposer(mix=True, action_repeat=L)]
     curriculum = Schedule(stages, [1])
@@ -116,14 +106,6 @@ def test_improving_reports_gains_cost_and_proposals() -> None:
     assert np.sum(metrics["histogram"]) == K * L * P
     assert not (weights(curriculum) == before).all()
     assert (solver.snapshot() == untrained).all()
-
-
-def test_proposals_are_a_function_of_solver_proposer_and_stream() -> None:
-    curriculum, solver = proposer(), student()
-    curriculum.improve(solver, cycle(0))
-    one, same, other = (curriculum.propose(solver, P, update(number)) for number in (3, 3, 4))
-    assert one.levels.batch_size == (1, P)
-    assert (one.levels == same.levels).all() and not (one.levels == other.levels).all()
 
 
 def test_proposing_costs_an_evaluation_where_an_action_begins() -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.points import Place, Points, measured
+from proposer_rl.curricula.points import Place, Points, measured, refuse_crossed
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import Count, checked
 from proposer_rl.streams import Streams
@@ -70,6 +70,7 @@ class BoundsCurriculum(Curriculum):
         measure: Measure = "success",
         rounded: bool = True,
     ) -> None:
+        refuse_crossed(lower, upper)
         self.space, self._points = space, Points(space, rounded)
         self.reads = ("success",) if measure == "success" else ()
         self._start, self._step = self._points.at(start), step

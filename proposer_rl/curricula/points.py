@@ -96,6 +96,16 @@ class Points:
         return torch.tensor([(start or {}).get(name, 0.0) for name in names], dtype=torch.float64)
 
 
+def refuse_crossed(lower: float, upper: float) -> None:
+    """Refuses thresholds of which a level would be both above and below.
+
+    Raises:
+        ArgumentError: if so.
+    """
+    if lower > upper:
+        raise ArgumentError(f"lower={lower}: must be at most upper={upper}")
+
+
 def measured(outcome: TensorDictBase, measure: str) -> Tensor:
     """Returns success or return of an outcome [K, n], whichever is the measure: float64 [K, n]."""
     return outcome[measure].double()

@@ -115,6 +115,16 @@ class ReplayCurriculum(Curriculum):
         seeds: Sequence[int] = (0,),
     ) -> None:
         synchronous = not train_on_new if synchronous is None else synchronous
+        if train_on_new and synchronous:
+            raise ArgumentError(
+                "train_on_new=true, synchronous=true: new levels are either trained on or only "
+                "scored; set one of them to false"
+            )
+        if renew and co_learnability:
+            raise ArgumentError(
+                f"co_learnability={co_learnability}, renew=true: where all scores are renewed "
+                "before each draw, nothing is left of what is added to them; set one of them to 0"
+            )
         if edits and edit is None:
             raise ArgumentError(
                 f"edits={edits}: the task has no edit(levels, count, generators) of its levels; "

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.points import measured
+from proposer_rl.curricula.points import measured, refuse_crossed
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import ArgumentError, checked
 from proposer_rl.streams import Streams
@@ -58,6 +58,7 @@ class RowsCurriculum(Curriculum):
         upper: float = 0.5,
         measure: Measure = "success",
     ) -> None:
+        refuse_crossed(lower, upper)
         names = [*space.axes]
         name = row or ("row" if "row" in names else names[0])
         if name not in names:

@@ -28,7 +28,7 @@ from proposer_rl.curricula.batches import fresh_levels
 from proposer_rl.curricula.buffer import level_keys
 from proposer_rl.curricula.combinators import draw_without_replacement
 from proposer_rl.streams import Streams
-from tests.curricula.living import TASK, live, solvers
+from tests.curricula.living import TASK, solvers
 from tests.curricula.made import LEARNED, filtered, learnt
 from tests.curricula.scripted import GivenScores
 from tests.tiny import evaluate
@@ -86,11 +86,6 @@ def test_the_coldest_filter_keeps_the_most_learnable() -> None:
         best = sorted(range(8 * P), key=lambda i: -row[i] * (1 - row[i]))[:P]
         assert sorted(kept[copy].tolist()) == sorted(keys[copy, best].tolist())
     assert (student.frames, student.evaluations) == (0, 8 * P)
-
-
-def test_scores_from_episodes_cost_frames() -> None:
-    lived = live(filtered(SamplingCurriculum(TASK.space), "episodes"), solvers([0]), [0], range(2))
-    assert lived.frames == [2 * 3 * P * T] * 2 and lived.evaluations == [0, 0]
 
 
 def test_a_proposers_student_trains_on_some_of_its_proposals() -> None:
@@ -203,12 +198,6 @@ def test_a_schedule_changes_at_the_exact_batch_and_gives_back_to_whom_it_came_fr
     assert stages[1].seen == [[11], [5.5]]
     assert curriculum.learnt() == {"first": 20}
     assert curriculum.log() == {"seen": stages[2].seen}
-
-
-def test_a_schedule_trains_replicas_where_a_stage_does() -> None:
-    plain = SamplingCurriculum(TASK.space)
-    assert not Schedule([plain, Noted(0)], [1]).trains_replicas
-    assert Schedule([plain, learnt()], [1]).trains_replicas
 
 
 @pytest.mark.parametrize(("count", "shares"), [(8, [4, 2, 2]), (3, [2, 0, 1]), (1, [0, 1, 0])])
