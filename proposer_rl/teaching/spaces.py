@@ -138,12 +138,10 @@ class Parameters(LevelSpace, ParameterSpace):
         check_torch_defaults()
         if seeded and SEED in ranges:
             raise ArgumentError("ranges.seed, seeded=True: a level has one seed; leave out either")
-        counts = dict.fromkeys(ranges, 8)
-        if isinstance(bins, Mapping):
-            _check_names("bins", bins, ranges)
-            counts |= {name: whole(f"bins.{name}", count, 1) for name, count in bins.items()}
-        else:
-            counts = dict.fromkeys(ranges, whole("bins", bins, 1))
+        named_bins = bins if isinstance(bins, Mapping) else {}
+        _check_names("bins", named_bins, ranges)
+        counts = dict.fromkeys(ranges, 8 if bins is named_bins else whole("bins", bins, 1))
+        counts |= {name: whole(f"bins.{name}", count, 1) for name, count in named_bins.items()}
         ranges = {name: python_values(given) for name, given in ranges.items()}
         in_file = {  # as task files have it, within the range
             name: given.pop("target")

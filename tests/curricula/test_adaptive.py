@@ -26,7 +26,6 @@ from proposer_rl.curricula.adaptive import (
     FLOOR,
     HIGH,
     LARGE,
-    LOGGED,
     LOW,
     TARGET,
     UNIFORM,
@@ -35,6 +34,7 @@ from proposer_rl.curricula.adaptive import (
     assigned,
     together,
 )
+from proposer_rl.curricula.outcome_model import LOGGED
 from proposer_rl.streams import Streams
 from proposer_rl.task import level_inputs
 

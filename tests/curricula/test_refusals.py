@@ -28,7 +28,6 @@ from proposer_rl.curricula import (
     SamplingCurriculum,
     Schedule,
     Scorer,
-    SomeBins,
     TransportCurriculum,
 )
 from proposer_rl.meta.actions import Mixture
@@ -79,8 +78,8 @@ REFUSED: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (no_edits, {"edits": 1}, "edits=1: the task has no edit"),
     (ReplayRule, {"temperature": 0.0}, "temperature=0.0: input should be greater than 0"),
     (Scorer, {"score": "regret", "source": "oracle"}, "source='oracle': input should be"),
-    (partial(SomeBins, SPACE), {"values": {"walls": [1]}}, r"values.walls=\[1.0\]: must be among"),
-    (partial(SomeBins, SPACE), {"values": {"path length": []}}, r"values.path length=\[\]: "),
+    (replay, {"new_levels": {"walls": [1]}}, r"new_levels.walls=\[1.0\]: must be among"),
+    (replay, {"new_levels": {"path length": []}}, r"new_levels.path length=\[\]: "),
     (partial(AdaptiveDifficulty, SPACE), {}, "pass_rates: none: this curriculum needs one of each"),
     (partial(AdaptiveDifficulty, ONE_RATE), {}, "pass_rates: 1 missing: this curriculum needs one"),
     (partial(CategoryBandit, ONE_RATE), {}, "features: have no texts: this curriculum needs a cat"),

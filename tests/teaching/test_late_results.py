@@ -193,7 +193,9 @@ def test_numbers_may_be_of_any_kind() -> None:
     teacher.tell(ids[0], torch.tensor(0.5))
     teacher.tell(np.int64(1), 1.5)
     teacher.tell([2], 2.5)
-    teacher.tell(ids[3:6], [3.5, 4.5, 5.5], episodes=8, steps=torch.tensor(3))
+    teacher.tell(ids[:0], [])
+    half = torch.tensor([3.5, 4.5, 5.5], dtype=torch.bfloat16, requires_grad=True)
+    teacher.tell(ids[3:6], half, episodes=8, steps=torch.tensor(3))
     teacher.drop(ids[6])
     assert len(teacher.propose(np.int64(3))) == 3
     assert [total for total, _ in curriculum.seen.values()] == [0.5, 1.5, 2.5, 3.5, 4.5, 5.5]
@@ -248,13 +250,3 @@ def test_a_loop_may_change_the_levels_that_it_gets(how: str) -> None:
                 level.fill_(9)
                 teacher.tell(ticket, i)
     assert (teacher.propose(8) < 1).all()
-
-
-def test_numbers_may_be_of_half_precision_and_have_no_gradient() -> None:
-    curriculum = Counting()
-    teacher = prl.Teacher(curriculum, ITEMS, block=2)
-    ids, _ = teacher.ask(2)
-    teacher.tell(ids[:0], [])
-    teacher.tell(ids, torch.tensor([0.5, 2.0], dtype=torch.bfloat16, requires_grad=True))
-    teacher.propose(1)  # takes in what was told
-    assert [total for total, _ in curriculum.seen.values()] == [0.5, 2.0]

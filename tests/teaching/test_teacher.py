@@ -393,20 +393,6 @@ def test_every_update_has_draws_of_its_own() -> None:
     assert not (third["gravity"] == first["gravity"]).any()
 
 
-def test_a_loop_may_score_levels_itself() -> None:
-    teacher = prl.Teacher(
-        prl.curricula.plr(capacity=16, fill=0.5, staleness=0.0, temperature=0.1),
-        prl.Items(16),
-        block=8,
-    )
-    for _ in range(20):
-        ids, items = teacher.ask(8)
-        teacher.tell(ids, torch.zeros(8), score=items.double())
-    buffer = teacher.curriculum.buffer[0]
-    filled = buffer["filled"]
-    assert (buffer["level", "item"].double() == buffer["score"])[filled].all()
-
-
 def observe(teacher: prl.Teacher, **outcome: Any) -> None:
     teacher.propose(4)
     teacher.observe(outcome)
