@@ -380,8 +380,6 @@ MANY = {f"p{i}": (0.0, 1.0) for i in range(12)}
     [
         prl.Parameters(PARTS, target={"range": 5.0, "texts": "c"}),
         prl.Parameters(PARTS, target={"range": 5.0}, seeded=True),
-        prl.Parameters({"one": [4]}, target={"one": 4}),
-        prl.Parameters({"texts": ["a", "b"]}, target={"texts": "b"}),
         prl.Parameters(MANY, bins=1, target=dict.fromkeys(MANY, 1.0)),
         LINE,
         prl.Parameters({"x": (0.0, 1.0)}),

@@ -16,11 +16,9 @@ from proposer_rl.curricula.transport import (
 )
 from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components, make
-from proposer_rl.settings import ArgumentError
 from proposer_rl.tasks.mazes import SpecificationSpace
 from proposer_rl.tasks.mazes.maze_settings import DistributionSettings, SpaceSettings
 from proposer_rl.tasks.parameters import ParameterSpace, intervals
-from proposer_rl.teaching import Items, Parameters, Teacher
 from tests.curricula.scripted import Scripted, step
 from tests.tiny import tiny_task
 
@@ -191,15 +189,3 @@ def test_the_nearest_distribution_is_found_where_the_solver_needs_slack(seed: in
     nearest = np.where(allowed, costs, np.inf)
     tied = nearest == nearest.min(1, keepdims=True)
     assert left <= (even * np.where(tied, costs[30], np.inf).min(1)).sum() + 1e-6
-
-
-@pytest.mark.parametrize(
-    ("space", "size"),
-    [
-        (Items(257, target=[0]), "257"),
-        (Parameters({name: (0.0, 1.0) for name in "abcd"}, target={"a": 1.0}), "4,096"),
-    ],
-)
-def test_more_bins_than_a_program_takes_are_refused_before_any_work(space: Any, size: str) -> None:
-    with pytest.raises(ArgumentError, match=f"space: {size} bins: .* on more than .*; give fewer"):
-        Teacher("model_transport", space)

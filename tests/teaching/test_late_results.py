@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from typing import Any
 
 import numpy as np
@@ -14,16 +13,9 @@ import proposer_rl as prl
 from proposer_rl.curricula import Batch, Curriculum
 from proposer_rl.settings import ArgumentError
 from tests.curricula.test_contract import same
-from tests.teaching.counting import ITEMS, Counting
+from tests.teaching.counting import ITEMS, Counting, through_torch
 
 SPACE = prl.Parameters({"force": (0.5, 4.5)}, bins=4, target={"force": 4.5})
-
-
-def loaded(state: Any, **how: Any) -> Any:
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True, **how)
 
 
 @pytest.mark.parametrize("resumed", [False, True])
@@ -39,9 +31,8 @@ def test_an_episode_may_be_longer_than_rollouts(resumed: bool) -> None:
         level = ids.expand(1, steps).unsqueeze(-1)
         teacher.observe(TensorDict({"level_id": level, "next": after}, [1, steps]))
         if resumed:
-            state = loaded(teacher.state_dict())
+            state = through_torch(teacher.state_dict())
             teacher = prl.Teacher(curriculum, ITEMS)
-            curriculum.load_state_dict = lambda state: None  # type: ignore[method-assign]
             teacher.load_state_dict(state)
     assert curriculum.seen[0][0] == 10
 
@@ -91,7 +82,7 @@ def test_a_score_is_told_of_all_levels_or_of_none() -> None:
         with pytest.raises(ArgumentError, match=r"score: missing: other levels were told with one"):
             first.tell(tickets, 0.0)
     resumed = teacher()
-    resumed.load_state_dict(loaded(first.state_dict()))
+    resumed.load_state_dict(through_torch(first.state_dict()))
     with pytest.raises(ArgumentError, match="score: missing"):
         resumed.tell(7, 0.0)
     first.tell(7, 0.0, score=5.0)  # what was refused counts nothing
@@ -114,8 +105,7 @@ def test_tickets_that_are_never_told_keep_their_own_blocks_alone() -> None:
     assert len(blocks) <= 3 and blocks[0].start == 0
     teacher.tell(lost[:2], [0.0, 1.0])  # one may still come back
     resumed = prl.Teacher(curriculum, ITEMS, block=16)
-    curriculum.load_state_dict = lambda state: None  # type: ignore[method-assign]
-    resumed.load_state_dict(loaded(teacher.state_dict()))
+    resumed.load_state_dict(through_torch(teacher.state_dict()))
     resumed.drop()
     for ticket in (int(lost[3]), lost[3:]):
         with pytest.raises(ArgumentError, match="ids=3: is over"):
@@ -178,7 +168,7 @@ def test_a_state_may_have_been_mapped_to_another_device() -> None:
     for _ in range(4):
         ids, levels = teacher.ask(6)
         teacher.tell(ids[1:], levels[1:].double())
-    state = loaded(teacher.state_dict())
+    state = through_torch(teacher.state_dict())
     other = prl.Teacher(recipe, ITEMS, block=8)
     other.load_state_dict(elsewhere(state))
     assert same(teacher.state_dict(), other.state_dict())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import random
 import re
@@ -25,7 +24,7 @@ import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching import sampler as module
 from tests.host_reads import CountedReads
-from tests.teaching.counting import ITEMS, Counting
+from tests.teaching.counting import ITEMS, Counting, through_torch
 
 REPEAT = 3
 
@@ -38,7 +37,6 @@ def parts(items: Any, size: int) -> Iterator[Any]:
 
 def sampled(length: int = 8) -> tuple[Counting, prl.Teacher, prl.TeacherSampler]:
     curriculum = Counting("success")
-    curriculum.load_state_dict = lambda state: None  # type: ignore[method-assign]
     teacher = prl.Teacher(curriculum, ITEMS, block=2)
     return curriculum, teacher, prl.TeacherSampler(teacher, length, repeat=REPEAT)
 
@@ -93,13 +91,6 @@ def test_what_is_refused_counts_nothing(what: str) -> None:
     sampler.tell([0, 0, 0, 1, 1, 1, 2, 2, 2], [1.0] * 9)
     teacher.propose(1)
     assert curriculum.seen == dict.fromkeys(range(3), (1.0, 1.0))
-
-
-def through_torch(state: Any) -> Any:
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
 
 
 def through_json(state: Any) -> Any:

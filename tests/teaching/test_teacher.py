@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 import json
 import math
 import pickle
@@ -27,6 +26,7 @@ from proposer_rl.curricula import Batch, Curriculum
 from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching.remote import TeacherClient
 from tests.curricula.test_contract import same
+from tests.teaching.counting import Counting, through_torch
 from tests.tiny import TASK
 
 NAN = float("nan")
@@ -46,39 +46,11 @@ def plr(**settings: Any) -> prl.Teacher:
     return prl.Teacher(prl.curricula.plr(**{**SMALL, **settings}), SPACE, block=8)
 
 
-class Spy(Curriculum):
-    """Levels that are numbered, and all that is observed of them."""
-
-    reads = ("success",)
-    remembers = ()
-
-    def __init__(self) -> None:
-        self.seen: dict[int, tuple[float, float]] = {}
-        self.count = 0
-
-    def propose(self, student: Any, count: int, streams: Any) -> Batch:
-        number = torch.arange(self.count, self.count + count).expand(len(streams), -1)
-        self.count += count
-        levels = TensorDict({"item": number}, number.shape)
-        return Batch(levels, TensorDict({"number": number}, number.shape))
-
-    def observe(self, student: Any, batch: Batch, outcome: Any) -> None:
-        assert (batch.levels["item"] == batch.notes["number"]).all()
-        for number, *came in zip(
-            batch.notes["number"][0].tolist(),
-            outcome["return"][0].tolist(),
-            outcome["success"][0].tolist(),
-            strict=True,
-        ):
-            assert number not in self.seen
-            self.seen[number] = tuple(came)
-
-
 @profile(max_examples=20)
 @given(st.data())
 def test_whatever_comes_back_reaches_its_own_level(data: st.DataObject) -> None:
     """Against a plain dict: singles, batches and parts, any number outstanding, in any order."""
-    spy = Spy()
+    spy = Counting("success")
     teacher = prl.Teacher(spy, ITEMS, block=data.draw(st.integers(1, 5)))
     out: dict[int, int] = {}  # ticket to level
     told: dict[int, tuple[float, float]] = {}
@@ -93,12 +65,8 @@ def test_whatever_comes_back_reaches_its_own_level(data: st.DataObject) -> None:
             assert ids.dtype == torch.int64 and not set(ids.tolist()) & set(out)
             out |= dict(zip(ids.tolist(), levels.tolist(), strict=True))
         elif do == "resume":
-            state = io.BytesIO()
-            torch.save(teacher.state_dict(), state)
-            state.seek(0)
             other = prl.Teacher(spy, ITEMS, block=teacher.block)
-            spy.load_state_dict = lambda state: None  # type: ignore[method-assign]
-            other.load_state_dict(torch.load(state, weights_only=True))
+            other.load_state_dict(through_torch(teacher.state_dict()))
             teacher = other
         elif out:
             few = data.draw(st.integers(1, len(out)))
@@ -177,11 +145,9 @@ def test_whoever_needs_nothing_works_from_returns_and_success(name: str, space: 
     whole = prl.Teacher(recipe, SPACES[space](), block=8, seed=3)
     assert whole.curriculum.needs == ()
     play(whole, 5)
-    file = io.BytesIO()
-    torch.save(whole.state_dict(), file)
-    file.seek(0)
+    state = through_torch(whole.state_dict())
     parts = prl.Teacher(recipe, SPACES[space](), block=8, seed=3)
-    parts.load_state_dict(torch.load(file, weights_only=True))
+    parts.load_state_dict(state)
     for one, other in zip(play(whole, 3), play(parts, 3), strict=True):
         assert same(plain(one), plain(other))
     assert same(whole.state_dict(), parts.state_dict())
