@@ -17,7 +17,6 @@ from hypothesis import given
 from hypothesis import settings as profile
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
-from tensordict import TensorDict
 
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
@@ -302,46 +301,6 @@ def test_what_is_no_number_there_is_refused_in_one_line(
     with pytest.raises(ArgumentError, match=rf"^{message}") as refused:
         make(given_, **more)
     assert "\n" not in str(refused.value)
-
-
-def rollout(*rewards: float, dtype: torch.dtype = torch.float32) -> TensorDict:
-    """An episode on one level."""
-    done = torch.zeros(1, len(rewards), 1, dtype=torch.bool)
-    done[:, -1] = True
-    after = {"reward": torch.tensor(rewards, dtype=dtype).view(1, -1, 1), "done": done}
-    return TensorDict({"next": {**after, "terminated": done, "success": done}}, done.shape[:2])
-
-
-def observe(*rewards: float, dtype: torch.dtype = torch.float32) -> Callable[[prl.Teacher], Any]:
-    return lambda t: t.observe(prl.outcome_of(rollout(*rewards, dtype=dtype)), ids=0)
-
-
-TOO_LARGE: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
-    "a return": (lambda t: t.tell(0, HUGE, 1), r"return_=1e\+39: must be finite in float32"),
-    "an integer": (lambda t: t.tell(0, 10**400, 1), "return_=1000.*: must be numbers of float32"),
-    "scores": (lambda t: t.tell([0], [0], [1], score=[INF]), "score=inf: must be finite"),
-    "episodes": (lambda t: t.tell(0, 0, 1, episodes=10**16), r"episodes=1e\+16: .* to 1e\+15"),
-    "a success": (lambda t: t.tell([0, 1], [0, 0], [1, np.nextafter(1, 2)]), "success=1.0+2: m"),
-    "complex ones": (lambda t: t.tell([0], torch.tensor([1j]), 1), "return_=.*: must be numbers"),
-    "a truth value as a ticket": (lambda t: t.tell(True, 0, 1), "ids=True: must be whole"),
-    "a rollout's sum": (observe(3e38, 3e38), "return_=inf: must be finite"),
-    "a sum of both signs": (observe(INF, -INF), "return_=nan: must be finite"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("what", TOO_LARGE)
-def test_what_float32_cannot_keep_is_refused_and_the_loop_goes_on(what: str) -> None:
-    curriculum = Counting("success")
-    teacher = prl.Teacher(curriculum, prl.Items(9), block=2)
-    teacher.ask(2)
-    wrong, message = TOO_LARGE[what]
-    with pytest.raises(ArgumentError, match=f"^{message}") as refused:
-        wrong(teacher)
-    assert "\n" not in str(refused.value)
-    teacher.drop(0)
-    teacher.tell(1, 3.4e38, 1)
-    teacher.ask()
-    assert curriculum.seen == {1: (pytest.approx(3.4e38), 1.0)}
 
 
 @pytest.mark.parametrize("name", ["plr", "learning_progress"])

@@ -366,6 +366,17 @@ def observe(teacher: prl.Teacher, **outcome: Any) -> None:
 
 ZEROS = [0.0] * 4
 MASKED = np.ma.array([0.0, 1.0], mask=[False, True])
+
+
+def ended(*rewards: float) -> Callable[[prl.Teacher], Any]:
+    """Observes an episode of a rollout on the level of the first ticket."""
+    done = torch.zeros(1, len(rewards), 1, dtype=torch.bool)
+    done[:, -1] = True
+    after = {"reward": torch.tensor(rewards).view(1, -1, 1), "done": done, "terminated": done}
+    rollout = TensorDict({"next": {**after, "success": done}}, done.shape[:2])
+    return lambda teacher: teacher.observe(prl.outcome_of(rollout), ids=0)
+
+
 REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
     "a ticket that was never given": (lambda t: t.tell(99, 0.0, 1), "ids=99: is no ticket"),
     "one that is not out yet": (lambda t: t.tell(6, 0.0, 1), "ids=6: has not been handed out"),
@@ -402,6 +413,14 @@ REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
         lambda t: t.observe(TensorDict({"next": {"done": torch.ones(4, 3, 1)}}, [4, 3])),
         "rollout: has no level_id",
     ),
+    "an integer": (lambda t: t.tell(0, 10**400, 1), "return_=1000.*: must be numbers of float32"),
+    "scores": (lambda t: t.tell([0], [0], [1], score=[math.inf]), "score=inf: must be finite"),
+    "many episodes": (lambda t: t.tell(0, 0, 1, episodes=10**16), r"episodes=1e\+16: .* to 1e\+15"),
+    "success": (lambda t: t.tell([0, 1], [0, 0], [1, np.nextafter(1, 2)]), "success=1.0+2: must"),
+    "complex ones": (lambda t: t.tell([0], torch.tensor([1j]), 1), "return_=.*: must be numbers"),
+    "a truth value as a ticket": (lambda t: t.tell(True, 0, 1), "ids=True: must be whole"),
+    "a rollout's sum": (ended(3e38, 3e38), "return_=inf: must be finite"),
+    "a sum of both signs": (ended(math.inf, -math.inf), "return_=nan: must be finite"),
     "no return": (lambda t: t.tell(0, None, 1), "return_=nan: must be finite"),
     "a result that there is not": (
         lambda t: observe(t, **{"return": ZEROS, "success": ZEROS, "sucess": ZEROS}),
