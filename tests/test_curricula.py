@@ -136,31 +136,6 @@ def test_a_restored_proposer_proposes_and_improves_alike(options: dict) -> None:
     assert metrics == other_metrics and (learnt == other_learnt).all()
 
 
-def test_an_interrupted_episode_is_played_again() -> None:
-    class Stop(Exception):
-        """An interruption."""
-
-    def stop(done: int) -> None:
-        raise Stop
-
-    whole, solver = proposer(**HELD), student()
-    expected = whole.improve(solver, cycle(0))
-    broken_off, again = proposer(**HELD), student()
-    before = broken_off.state_dict()
-    assert broken_off.trainer is not None
-    broken_off.trainer.env.on_update = stop
-    with pytest.raises(Stop):
-        broken_off.improve(again, cycle(0))
-    # In the same process, and in another one.
-    broken_off.trainer.env.on_update = lambda done: None
-    for resumed in (broken_off, proposer(**HELD)):
-        fresh = student()
-        resumed.load_state_dict(before)
-        assert resumed.improve(fresh, cycle(0)) == expected
-        assert (weights(resumed) == weights(whole)).all()
-        assert (fresh.snapshot() == solver.snapshot()).all()
-
-
 def test_an_own_action_holds_and_a_mode_is_no_matter_of_chance() -> None:
     actions = {}
     for own in ("sample", "mode"):
