@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 import torch
 from annotated_types import Interval
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.settings import ArgumentError
@@ -104,11 +103,6 @@ def refuse_crossed(lower: float, upper: float) -> None:
     """
     if lower > upper:
         raise ArgumentError(f"lower={lower}: must be at most upper={upper}")
-
-
-def measured(outcome: TensorDictBase, measure: str) -> Tensor:
-    """Returns success or return of an outcome [K, n], whichever is the measure: float64 [K, n]."""
-    return outcome[measure].double()
 
 
 def nearest(points: Tensor, places: Tensor) -> Tensor:
