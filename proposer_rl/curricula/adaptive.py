@@ -41,7 +41,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from proposer_rl.curricula.batches import packed
+from proposer_rl.curricula.batches import finite, packed
 from proposer_rl.curricula.belief import Belief
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.outcome_model import Predictions
@@ -355,11 +355,7 @@ class AdaptiveMixture(Curriculum):
         return every[torch.randperm(count, generator=draw)]
 
     def _inputs(self, levels: Levels) -> Tensor:
-        known = self._known(levels).double().cpu()
-        if not known.isfinite().all():
-            wrong = (~known.isfinite()).sum()
-            raise ValueError(f"inputs: {wrong} of {known.numel()} numbers are not finite")
-        return known
+        return finite("inputs", self._known(levels))
 
     def _items(self, levels: Levels) -> Tensor | None:
         space: Any = self._space

@@ -120,6 +120,18 @@ def of_kind(like: Levels, state: Mapping[str, Any]) -> Levels:
     return type(like).from_dict(state, batch_dims=2)
 
 
+def finite(name: str, numbers: Tensor) -> Tensor:
+    """Returns numbers as float64 on the CPU.
+
+    Raises:
+        ValueError: if they are not all finite.
+    """
+    numbers = numbers.double().cpu()
+    if wrong := int((~numbers.isfinite()).sum()):
+        raise ValueError(f"{name}: {wrong} of {numbers.numel()} numbers are not finite")
+    return numbers
+
+
 def device_of(levels: Levels) -> torch.device:
     """Returns the device of levels, which are a tensordict or a tensor."""
     if isinstance(levels, Tensor):

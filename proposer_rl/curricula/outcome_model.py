@@ -37,7 +37,7 @@ from annotated_types import Ge
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.batches import device_of, saved
+from proposer_rl.curricula.batches import device_of, finite, saved
 from proposer_rl.curricula.combinators import Combinator
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.student import ABILITIES, Student
@@ -295,11 +295,7 @@ class Modelled(Combinator):
         return self._model.predict(self._phi(levels)).to(device_of(levels))
 
     def _phi(self, levels: Levels) -> Tensor:
-        phi = self._features(levels).double().cpu()
-        wrong = (~phi.isfinite()).sum()
-        if wrong:
-            raise ValueError(f"features: {int(wrong)} of {phi.numel()} numbers are not finite")
-        return phi
+        return finite("features", self._features(levels))
 
 
 class Predictions:

@@ -59,8 +59,7 @@ class SelfPacedCurriculum(Curriculum):
         means, deviations: of the distributions, float64 [K, D].
 
     Raises:
-        ValueError: for an unknown axis, deviations that are not in order, or a space that has no
-            points.
+        ValueError: for an unknown axis, or a space that has no points.
     """
 
     remembers = ("means", "deviations", "_episodes", "_expected", "_counts", "_inbox")

@@ -71,26 +71,12 @@ def test_an_episode_goes_to_the_level_that_it_began_on(afresh: bool, steps: int)
         assert (rollout["next", "level_id"] == rollout["level_id"]).all()
 
 
-@pytest.mark.parametrize("afresh", [True, False])
-def test_rollouts_say_themselves_which_levels_they_are_of(afresh: bool) -> None:
-    """Whole episodes, also those that began in an earlier rollout."""
-    teacher = counted("rollout", "success", block=3)
-    env = taught(teacher, tell=False)
-    for rollout in collected(env, 3, 6, reset_at_each_iter=afresh):
-        teacher.observe(rollout)
-    check(teacher.curriculum.seen)
-    assert len(teacher.curriculum.rollouts) == len(teacher.curriculum.seen) > 4
-    for number, rollout in teacher.curriculum.rollouts.items():
-        steps = int(length(number))
-        assert rollout["observation"].flatten()[:steps].tolist() == list(range(steps))
-        assert rollout["next", "done"].flatten().tolist() == [
-            step == steps - 1 for step in range(len(rollout))
-        ]
-
-
 @pytest.mark.parametrize("how", ["alternating", "one after another", "split", "lazy"])
 def test_an_episode_is_put_together_from_whichever_rows_it_is_in(how: str) -> None:
-    """As of several workers that come by turns, or whose time is one line; or of trajectories."""
+    """As of several workers that come by turns, or whose time is one line; or of trajectories.
+
+    Whole episodes, also those that began in an earlier rollout.
+    """
     teacher = counted("rollout", "success", block=3)
     workers = [
         Collector(
@@ -117,6 +103,7 @@ def test_an_episode_is_put_together_from_whichever_rows_it_is_in(how: str) -> No
         steps = int(length(number))
         assert rollout["observation"].flatten()[:steps].tolist() == list(range(steps))
         assert rollout["is_step"].sum() == steps
+        assert rollout["next", "done"].flatten().nonzero().tolist() == [[steps - 1]]
 
 
 def test_rollouts_may_be_cut_by_a_transform_behind_it() -> None:
