@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import random
 import re
+import sys
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from threading import Barrier, local
@@ -24,6 +26,7 @@ import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching import sampler as module
 from tests.host_reads import CountedReads
+from tests.teaching.conftest import Install
 from tests.teaching.counting import ITEMS, Counting, through_torch
 
 REPEAT = 3
@@ -172,11 +175,20 @@ def test_an_epoch_goes_on_from_every_place() -> None:
         replayed(rounds=1)[1].load_state_dict(state)
 
 
+LOADERS = (
+    "torchdata==0.11.0 accelerate==1.15.0 huggingface-hub==2.4.0 safetensors==0.8.0 psutil==7.2.2 "
+    "hf-xet==1.8.0 httpx2==2.16.2 httpcore2==2.16.2 truststore==0.10.5 typer==0.29.2 "
+    "shellingham==1.5.4"
+)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # torchdata's own
 @pytest.mark.parametrize("stateful", [True, False])
-def test_loaders_that_go_on_find_the_place(stateful: bool) -> None:
+def test_loaders_that_go_on_find_the_place(stateful: bool, install: Install) -> None:
     """torchdata's by the sampler's state; accelerate's skips what it has had."""
-    package = "torchdata.stateful_dataloader" if stateful else "accelerate"
-    made = pytest.importorskip(package)
+    sys.path.append(str(install(LOADERS)))  # last: what is there already stays
+    made: Any = import_module("torchdata.stateful_dataloader" if stateful else "accelerate")
 
     def batches(sampler: prl.TeacherSampler) -> Any:
         if stateful:
