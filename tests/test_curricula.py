@@ -13,7 +13,6 @@ from proposer_rl.curricula import (
     ProposerTrainer,
     SamplingCurriculum,
     Schedule,
-    Student,
     TaskStudent,
 )
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, PPOSettings, agent_weights, load_agent
@@ -80,15 +79,6 @@ def weights(curriculum: ProposerCurriculum) -> TensorDict:
     return curriculum.trainer.learner.snapshot()
 
 
-def test_a_copys_levels_depend_on_its_stream_alone() -> None:
-    curriculum = SamplingCurriculum(SPACE)
-    both = curriculum.propose(Student(), P, [Streams(0), Streams(1)])
-    alone = curriculum.propose(Student(), P, [Streams(1)])
-    assert both.levels.batch_size == (2, P)
-    assert (both.levels[1] == alone.levels[0]).all()
-    assert not (both.levels[0] == both.levels[1]).all()
-
-
 def test_a_proposer_may_begin_within_a_cycle() -> None:
     stages = [SamplingCurriculum(SPACE), proposer(mix=True, action_repeat=L)]
     curriculum = Schedule(stages, [1])
@@ -118,14 +108,6 @@ def test_improving_reports_gains_cost_and_proposals() -> None:
     assert (solver.snapshot() == untrained).all()
 
 
-def test_proposals_are_a_function_of_solver_proposer_and_stream() -> None:
-    curriculum, solver = proposer(), student()
-    curriculum.improve(solver, cycle(0))
-    one, same, other = (curriculum.propose(solver, P, update(number)) for number in (3, 3, 4))
-    assert one.levels.batch_size == (1, P)
-    assert (one.levels == same.levels).all() and not (one.levels == other.levels).all()
-
-
 def test_proposing_costs_an_evaluation_where_an_action_begins() -> None:
     curriculum, solver = proposer(**HELD), student()
     curriculum.improve(solver, cycle(0))
@@ -152,31 +134,6 @@ def test_a_restored_proposer_proposes_and_improves_alike(options: dict) -> None:
     (levels, metrics, learnt), (other_levels, other_metrics, other_learnt) = came
     assert all((one == other).all() for one, other in zip(levels, other_levels, strict=True))
     assert metrics == other_metrics and (learnt == other_learnt).all()
-
-
-def test_an_interrupted_episode_is_played_again() -> None:
-    class Stop(Exception):
-        """An interruption."""
-
-    def stop(done: int) -> None:
-        raise Stop
-
-    whole, solver = proposer(**HELD), student()
-    expected = whole.improve(solver, cycle(0))
-    broken_off, again = proposer(**HELD), student()
-    before = broken_off.state_dict()
-    assert broken_off.trainer is not None
-    broken_off.trainer.env.on_update = stop
-    with pytest.raises(Stop):
-        broken_off.improve(again, cycle(0))
-    # In the same process, and in another one.
-    broken_off.trainer.env.on_update = lambda done: None
-    for resumed in (broken_off, proposer(**HELD)):
-        fresh = student()
-        resumed.load_state_dict(before)
-        assert resumed.improve(fresh, cycle(0)) == expected
-        assert (weights(resumed) == weights(whole)).all()
-        assert (fresh.snapshot() == solver.snapshot()).all()
 
 
 def test_an_own_action_holds_and_a_mode_is_no_matter_of_chance() -> None:

@@ -12,16 +12,9 @@ from collections.abc import Callable
 from typing import Any
 
 from proposer_rl.curricula.adaptive import AdaptiveMixture as AdaptiveMixture
-from proposer_rl.curricula.batches import SomeBins as SomeBins
-from proposer_rl.curricula.batches import level_keys as level_keys
 from proposer_rl.curricula.bins import BinCurriculum as BinCurriculum
 from proposer_rl.curricula.bounds import BoundsCurriculum as BoundsCurriculum
 from proposer_rl.curricula.buffer import ReplayRule as ReplayRule
-from proposer_rl.curricula.buffer import draw_slots as draw_slots
-from proposer_rl.curricula.buffer import empty_buffer as empty_buffer
-from proposer_rl.curricula.buffer import insert as insert
-from proposer_rl.curricula.buffer import replay_weights as replay_weights
-from proposer_rl.curricula.buffer import rescore as rescore
 from proposer_rl.curricula.combinators import Filtered as Filtered
 from proposer_rl.curricula.combinators import Mixed as Mixed
 from proposer_rl.curricula.combinators import Schedule as Schedule

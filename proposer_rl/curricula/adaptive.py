@@ -41,10 +41,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from proposer_rl.curricula.batches import packed
+from proposer_rl.curricula.batches import finite, packed
 from proposer_rl.curricula.belief import Belief
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.outcome_model import calibration
+from proposer_rl.curricula.outcome_model import Predictions
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import Count, Share, checked
 from proposer_rl.streams import Streams
@@ -77,7 +77,6 @@ NEAR = 0.025  # standard deviation of what is added between two levels, in share
 AT_ONCE, LARGE = 64, 512
 FORBIDDEN = 1e3  # cost of a candidate that is not mastered
 FAILURES = 4.0  # on the target, that are taken for seen at the beginning
-LOGGED = 100  # batches at most, whose predictions a log is about
 SHOWN = 6  # levels of each arm that a reader is shown
 OUTLIERS, MOST_OUTLIERS = 1000, 63  # one in so many returns at either end; and at most
 EQUAL = 1e-9  # returns that differ no more than this are equal, in units of the largest
@@ -130,8 +129,7 @@ class AdaptiveMixture(Curriculum):
         self._ends, self._number = torch.zeros(2, 0, 0, dtype=torch.float64), 0
         self._told = False  # whether success is told
         self._last: dict[str, Levels] = {}  # on the way, of each student [m]
-        # What was predicted, and what it was [K, m]; loops may go on for ever without a log.
-        self._seen: list[tuple[Tensor, Tensor]] = []
+        self._seen = Predictions()
         self._some: dict[str, Levels] = {}  # of the last levels, by their arms
         self._shown: dict[str, Any] = {}
 
@@ -171,11 +169,7 @@ class AdaptiveMixture(Curriculum):
         shown, self._shown = self._shown, {}
         if self._some:
             shown["levels"], self._some = self._some, {}
-        if self._seen:
-            predicted, success = (torch.cat(one, 1) for one in zip(*self._seen, strict=True))
-            shown |= calibration(predicted, success)
-            self._seen.clear()
-        return shown
+        return shown | self._seen.log()
 
     def state_dict(self) -> dict[str, Any]:
         """Returns also the belief, the last levels of the way, and some of each arm."""
@@ -224,7 +218,7 @@ class AdaptiveMixture(Curriculum):
             for belief, x, label, own, count in every:
                 belief.grow_older(batches)
                 belief.observe(x, label, own, count)
-            self._seen = [*self._seen[1 - LOGGED :], (seen["predicted"], success)]
+            self._seen.add(seen["predicted"], success)
             of = {
                 "levels": torch.ones_like(labels),
                 "successes": success,
@@ -361,11 +355,7 @@ class AdaptiveMixture(Curriculum):
         return every[torch.randperm(count, generator=draw)]
 
     def _inputs(self, levels: Levels) -> Tensor:
-        known = self._known(levels).double().cpu()
-        if not known.isfinite().all():
-            wrong = (~known.isfinite()).sum()
-            raise ValueError(f"inputs: {wrong} of {known.numel()} numbers are not finite")
-        return known
+        return finite("inputs", self._known(levels))
 
     def _items(self, levels: Levels) -> Tensor | None:
         space: Any = self._space

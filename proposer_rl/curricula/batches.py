@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
-from annotated_types import Len
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.settings import ArgumentError, checked
+from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space
 
@@ -25,7 +24,8 @@ class SomeBins:
 
     Args:
         space: with the bins.
-        values: for some of its axes, by name, those values whose bins count.
+        values: for some of its axes, by name, those values whose bins count; named as the argument
+            of replay in errors.
 
     Raises:
         ArgumentError: for an axis or a value that the space does not have.
@@ -38,13 +38,12 @@ class SomeBins:
         tensor([0, 1, 2])
     """
 
-    @checked
-    def __init__(self, space: Space, values: dict[str, Annotated[list[float], Len(1)]]) -> None:
+    def __init__(self, space: Space, values: Mapping[str, list[float]]) -> None:
         axes = {name: list(known) for name, known in space.axes.items()}
         for name, wanted in values.items():
             if any(value not in axes.get(name, ()) for value in wanted):
                 raise ArgumentError(
-                    f"values.{name}={wanted}: must be among the space's axes {axes}"
+                    f"new_levels.{name}={wanted}: must be among the space's axes {axes}"
                 )
         counts = [
             torch.tensor([value in values.get(name, known) for value in known])
@@ -119,6 +118,18 @@ def unpacked(state: Mapping[str, Any], like: Levels | None) -> TensorDict:
 def of_kind(like: Levels, state: Mapping[str, Any]) -> Levels:
     """Returns levels [K, m] of the class of ``like``, from nested dicts of their entries."""
     return type(like).from_dict(state, batch_dims=2)
+
+
+def finite(name: str, numbers: Tensor) -> Tensor:
+    """Returns numbers as float64 on the CPU.
+
+    Raises:
+        ValueError: if they are not all finite.
+    """
+    numbers = numbers.double().cpu()
+    if wrong := int((~numbers.isfinite()).sum()):
+        raise ValueError(f"{name}: {wrong} of {numbers.numel()} numbers are not finite")
+    return numbers
 
 
 def device_of(levels: Levels) -> torch.device:

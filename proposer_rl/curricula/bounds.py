@@ -12,7 +12,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.points import Place, Points, measured
+from proposer_rl.curricula.points import Place, Points, refuse_crossed
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import Count, checked
 from proposer_rl.streams import Streams
@@ -70,6 +70,7 @@ class BoundsCurriculum(Curriculum):
         measure: Measure = "success",
         rounded: bool = True,
     ) -> None:
+        refuse_crossed(lower, upper)
         self.space, self._points = space, Points(space, rounded)
         self.reads = ("success",) if measure == "success" else ()
         self._start, self._step = self._points.at(start), step
@@ -102,13 +103,9 @@ class BoundsCurriculum(Curriculum):
         return self._inbox.batch(levels, bins=bins, bound=which, at=places)
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Keeps what levels on bounds came to, which the next proposal adds to the bounds' sums.
-
-        Raises:
-            ValueError: if the outcome has no success and success is the measure.
-        """
+        """Keeps what levels on bounds came to, which the next proposal adds to the bounds' sums."""
         self._inbox.check(batch, outcome)
-        reached = measured(outcome, self._measure)
+        reached = outcome[self._measure].double()
         self._counts += counts_of_bins(batch.notes["bins"], self.space)
         self._inbox.put(batch, **batch.notes.select("bound", "at"), reached=reached)
 

@@ -37,7 +37,7 @@ from annotated_types import Ge
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.batches import device_of
+from proposer_rl.curricula.batches import device_of, finite, saved
 from proposer_rl.curricula.combinators import Combinator
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.student import ABILITIES, Student
@@ -56,6 +56,7 @@ CLOSE = 1e-10  # coefficients that change no more than this are found
 EQUAL = 1e-6  # returns that differ no more than this are equal, in units of the worst one
 
 ANSWERED = ("performance", "exact_performance")
+LOGGED = 100  # batches at most, whose predictions a log is about: loops may go on without one
 PARTS = 10  # of the probabilities from 0 to 1, in which what was predicted is compared
 
 
@@ -254,7 +255,7 @@ class Modelled(Combinator):
         self._model = OutcomeModel(labels=labels, ridge=ridge, half_life=half_life)
         self._inbox = Inbox()
         self._has_taken = False  # whether anything since the last proposal, as logs make it
-        self._seen: list[dict[str, Tensor]] = []  # what was predicted, and what it was, [K, m]
+        self._seen = Predictions()
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """Returns what the curriculum proposes, with a student whose performance is predicted."""
@@ -279,22 +280,14 @@ class Modelled(Combinator):
     def log(self) -> dict[str, Any]:
         """Returns also how right the model was, as :func:`calibration`."""
         self._take_in()
-        log = super().log()
-        if not self._seen:
-            return log
-        predicted, label = (
-            torch.cat([seen[name] for seen in self._seen], 1) for name in ("predicted", "label")
-        )
-        self._seen = []
-        return log | calibration(predicted, label)
+        return super().log() | self._seen.log()
 
     def _take_in(self) -> None:
         """Adds the outcomes since the last proposal to the model's data as one batch."""
         if not (taken := self._inbox.take()):
             return
         evidence: Any = torch.cat(taken, 1)
-        label = self._model.labels(evidence)
-        self._seen.append({"predicted": evidence["predicted"], "label": label})
+        self._seen.add(evidence["predicted"], self._model.labels(evidence))
         self._model.add(evidence["features"], evidence, as_old=self._has_taken)
         self._has_taken = True
 
@@ -302,11 +295,31 @@ class Modelled(Combinator):
         return self._model.predict(self._phi(levels)).to(device_of(levels))
 
     def _phi(self, levels: Levels) -> Tensor:
-        phi = self._features(levels).double().cpu()
-        wrong = (~phi.isfinite()).sum()
-        if wrong:
-            raise ValueError(f"features: {int(wrong)} of {phi.numel()} numbers are not finite")
-        return phi
+        return finite("features", self._features(levels))
+
+
+class Predictions:
+    """What was predicted of levels, and what it was, since the last log."""
+
+    def __init__(self) -> None:
+        self._seen: list[list[Tensor]] = []
+
+    def add(self, predicted: Tensor, label: Tensor) -> None:
+        """Adds probabilities and labels of a batch, float64 [K, m] each."""
+        self._seen = [*self._seen[1 - LOGGED :], [predicted, label]]
+
+    def log(self) -> dict[str, Any]:
+        """Returns their :func:`calibration`, or nothing, and begins anew."""
+        seen, self._seen = self._seen, []
+        return calibration(*(torch.cat(one, 1) for one in zip(*seen, strict=True))) if seen else {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns what was added since the last log."""
+        return {"seen": saved(self._seen)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Puts back what :meth:`state_dict` returned."""
+        self._seen = saved(state["seen"])
 
 
 def calibration(predicted: Tensor, label: Tensor) -> dict[str, Any]:

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 import torch
 from annotated_types import Interval
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.settings import ArgumentError
@@ -96,9 +95,14 @@ class Points:
         return torch.tensor([(start or {}).get(name, 0.0) for name in names], dtype=torch.float64)
 
 
-def measured(outcome: TensorDictBase, measure: str) -> Tensor:
-    """Returns success or return of an outcome [K, n], whichever is the measure: float64 [K, n]."""
-    return outcome[measure].double()
+def refuse_crossed(lower: float, upper: float) -> None:
+    """Refuses thresholds of which a level would be both above and below.
+
+    Raises:
+        ArgumentError: if so.
+    """
+    if lower > upper:
+        raise ArgumentError(f"lower={lower}: must be at most upper={upper}")
 
 
 def nearest(points: Tensor, places: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.outcome_model import calibration
+from proposer_rl.curricula.outcome_model import Predictions
 from proposer_rl.curricula.scores import mixed, single
 from proposer_rl.curricula.student import Student
 from proposer_rl.meta.actions import systematic_draw
@@ -30,7 +30,6 @@ from proposer_rl.settings import ArgumentError, Decay, Positive, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Space, refuse_unfit_bins
 
-LOGGED = 100  # batches at most, whose predictions a log is about
 PRIOR = math.pi**2 / 16 - 0.5  # variance of the arc length of a probability that is uniform
 
 
@@ -51,7 +50,7 @@ class ItemCurriculum(Curriculum):
         self.space = space
         self.numbers: dict[str, Tensor] = {}  # each [K, ...]; none before the first proposal
         self._inbox = Inbox()
-        self._seen: list[tuple[Tensor, Tensor]] = []  # what was predicted, and what it was
+        self._seen = Predictions()
 
     @abstractmethod
     def first_numbers(self, students: int) -> dict[str, Tensor]:
@@ -105,11 +104,7 @@ class ItemCurriculum(Curriculum):
 
     def log(self) -> dict[str, Any]:
         """Returns how right the belief was, as of the adaptive mixture, if there is one."""
-        if not self._seen:
-            return {}
-        predicted, success = (torch.cat(one, 1) for one in zip(*self._seen, strict=True))
-        self._seen.clear()
-        return calibration(predicted, success)
+        return self._seen.log()
 
     def _take_in(self) -> None:
         for came in self._inbox.take():
@@ -117,8 +112,7 @@ class ItemCurriculum(Curriculum):
                 seen = {name: came[name][k] for name in ("item", "success", "count")}
                 self.learn(self._own(k), seen)
             if "predicted" in came.keys():
-                new = came["predicted"], came["success"]
-                self._seen = [*self._seen[1 - LOGGED :], new]
+                self._seen.add(came["predicted"], came["success"])
 
     def _own(self, k: int) -> dict[str, Tensor]:
         """Returns views of the numbers of a student."""

@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal, cast
 
 import torch
-from annotated_types import Interval
+from annotated_types import Interval, Len
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -101,7 +101,7 @@ class ReplayCurriculum(Curriculum):
         scorer: Scorer,
         rule: ReplayRule | None = None,
         *,
-        new_levels: dict[str, list[float]] | None = None,
+        new_levels: dict[str, Annotated[list[float], Len(1)]] | None = None,
         capacity: Count = 4000,
         fill: Positive = 0.5,
         replay_probability: Annotated[float, Interval(gt=0, le=1)] = 0.5,
@@ -115,6 +115,16 @@ class ReplayCurriculum(Curriculum):
         seeds: Sequence[int] = (0,),
     ) -> None:
         synchronous = not train_on_new if synchronous is None else synchronous
+        if train_on_new and synchronous:
+            raise ArgumentError(
+                "train_on_new=true, synchronous=true: new levels are either trained on or only "
+                "scored; set one of them to false"
+            )
+        if renew and co_learnability:
+            raise ArgumentError(
+                f"co_learnability={co_learnability}, renew=true: where all scores are renewed "
+                "before each draw, nothing is left of what is added to them; set one of them to 0"
+            )
         if edits and edit is None:
             raise ArgumentError(
                 f"edits={edits}: the task has no edit(levels, count, generators) of its levels; "
@@ -125,13 +135,8 @@ class ReplayCurriculum(Curriculum):
         aside = not train_on_new or edits or renew
         self.needs = scorer.needs if aside else scorer.asks
         self.reads = (*scorer.reads, "rollout") if self._easy else scorer.reads
-        self._new_levels = space
-        if new_levels is not None:
-            try:
-                self._new_levels = SomeBins(cast(Space, space), new_levels)
-            except ArgumentError as error:
-                said = str(error).removeprefix("values.")
-                raise ArgumentError(f"new_levels.{said}") from error
+        bins = space if new_levels is None else SomeBins(cast(Space, space), new_levels)
+        self._new_levels = bins
         self.scorer, self._rule = scorer, rule or ReplayRule()
         self._capacity, self._warm = capacity, fill * capacity
         self._probability = replay_probability

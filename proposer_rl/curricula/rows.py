@@ -13,7 +13,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.points import measured
+from proposer_rl.curricula.points import refuse_crossed
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import ArgumentError, checked
 from proposer_rl.streams import Streams
@@ -58,6 +58,7 @@ class RowsCurriculum(Curriculum):
         upper: float = 0.5,
         measure: Measure = "success",
     ) -> None:
+        refuse_crossed(lower, upper)
         names = [*space.axes]
         name = row or ("row" if "row" in names else names[0])
         if name not in names:
@@ -97,13 +98,9 @@ class RowsCurriculum(Curriculum):
         return self._inbox.batch(levels, bins=bins, row=rows)
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Keeps the rows that follow, for the next proposal.
-
-        Raises:
-            ValueError: if the outcome has no success and success is the measure.
-        """
+        """Keeps the rows that follow, for the next proposal."""
         self._inbox.check(batch, outcome)
-        reached = measured(outcome, self._measure).cpu()
+        reached = outcome[self._measure].double().cpu()
         move = (reached >= self._upper).long() - (reached < self._lower).long()
         self._counts += counts_of_bins(batch.notes["bins"], self.space)
         self._inbox.put(batch, next=(batch.notes["row"] + move).clamp(min=0))

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.points import Place, Points, measured
+from proposer_rl.curricula.points import Place, Points
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import Count, Positive, checked
 from proposer_rl.streams import Streams
@@ -59,8 +59,7 @@ class SelfPacedCurriculum(Curriculum):
         means, deviations: of the distributions, float64 [K, D].
 
     Raises:
-        ValueError: for an unknown axis, deviations that are not in order, or a space that has no
-            points.
+        ValueError: for an unknown axis, or a space that has no points.
     """
 
     remembers = ("means", "deviations", "_episodes", "_expected", "_counts", "_inbox")
@@ -119,13 +118,9 @@ class SelfPacedCurriculum(Curriculum):
         return self._inbox.batch(levels, bins=bins, points=points, log_density=log_density)
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Keeps what levels came to, for the next step.
-
-        Raises:
-            ValueError: if the outcome has no success and success is the measure.
-        """
+        """Keeps what levels came to, for the next step."""
         self._inbox.check(batch, outcome)
-        reached = measured(outcome, self._measure)
+        reached = outcome[self._measure].double()
         self._counts += counts_of_bins(batch.notes["bins"], self.space)
         self._inbox.put(batch, **batch.notes.select("points", "log_density"), reached=reached)
 

@@ -13,26 +13,20 @@ from proposer_rl.curricula.batches import moved
 OF_LEVELS = ("optimal_return", "exact_performance", "performance", "play")
 
 
-def adapted(
-    name: str,
-    function: Any,
-    given: Callable[[Any], Any],
-    device: torch.device | None = None,
-) -> Any:
+def adapted(name: str, function: Any, given: Callable[[Any], Any], device: torch.device) -> Any:
     """Returns a function of levels [1, n] that calls a loop's own function of levels [n].
 
     Args:
         name: of the function; see :class:`~proposer_rl.curricula.Student`.
         function: of a loop, called with levels as the loop gets them.
         given: makes these of levels.
-        device: on which it gets them; None to leave them where they are.
+        device: on which it gets them.
     """
     if name not in OF_LEVELS:
         return function
 
     def of_one(levels: Any, *more: Any) -> Any:
-        some = levels[0] if levels.ndim > 1 else levels
-        some = some if device is None else moved(some, device)
+        some = moved(levels[0] if levels.ndim > 1 else levels, device)
         draws = [more[0][0]] if name == "play" else []
         found = function(given(some.clone()), *draws)  # which may change them
         if isinstance(found, TensorDictBase):

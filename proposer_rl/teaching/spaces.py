@@ -138,12 +138,10 @@ class Parameters(LevelSpace, ParameterSpace):
         check_torch_defaults()
         if seeded and SEED in ranges:
             raise ArgumentError("ranges.seed, seeded=True: a level has one seed; leave out either")
-        counts = dict.fromkeys(ranges, 8)
-        if isinstance(bins, Mapping):
-            _check_names("bins", bins, ranges)
-            counts |= {name: whole(f"bins.{name}", count, 1) for name, count in bins.items()}
-        else:
-            counts = dict.fromkeys(ranges, whole("bins", bins, 1))
+        named_bins = bins if isinstance(bins, Mapping) else {}
+        _check_names("bins", named_bins, ranges)
+        counts = dict.fromkeys(ranges, 8 if bins is named_bins else whole("bins", bins, 1))
+        counts |= {name: whole(f"bins.{name}", count, 1) for name, count in named_bins.items()}
         ranges = {name: python_values(given) for name, given in ranges.items()}
         in_file = {  # as task files have it, within the range
             name: given.pop("target")
@@ -288,25 +286,23 @@ class Items(LevelSpace):
             number = lines[tuple(wrong[0])]
             what = f"must be finite in float32, as of item {int(wrong[0, 0])}"
             raise ArgumentError(f"features={number:g}: {what}")
-        self.pass_rates = None
+        self.pass_rates = self.expected = None
+        columns = known = torch.zeros(count, 0)
         if pass_rates is not None:
             rates = as_numbers("pass_rates", pass_rates, (count,), 0, 1, unknown=True)
             self.pass_rates = torch.from_numpy(rates)
-        self.expected = None if self.pass_rates is None else expected_log_odds(self.pass_rates)
-        columns = known = torch.zeros(count, 0)
-        if self.pass_rates is not None:
+            self.expected = expected_log_odds(self.pass_rates)
             columns = rate_columns(self.pass_rates)
         if features is not None:
             known = few_columns(lines, others=columns.shape[1])
         self._inputs = torch.cat([known, columns], 1)
         low, high = lines.amin(0), lines.amax(0)
         self.coordinates = (2 * (lines - low) / (high - low).clamp_min(1e-12) - 1).float()
-        parts: dict[str, _SomeItems] = {}
-        for name, given in _distributions(target, named).items():
-            places = _item_places(name, given, count)
-            parts[name] = _SomeItems(torch.tensor(places))
-        self._parts = parts
-        self.distributions = {"all": self, **parts}
+        self._parts = {
+            name: _SomeItems(torch.tensor(_item_places(name, given, count)))
+            for name, given in _distributions(target, named).items()
+        }
+        self.distributions = {"all": self, **self._parts}
 
     @property
     def target_shares(self) -> Tensor:

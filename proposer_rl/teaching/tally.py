@@ -26,21 +26,13 @@ class Tally:
     def __init__(self, space: Any) -> None:
         self._space = space.space
         self._texts = _bin_texts(self._space)
-        self._shape = len(self._texts), max(map(len, self._texts.values()), default=1)
-        self._firsts = torch.arange(self._shape[0]).unsqueeze(-1) * self._shape[1]
-        if isinstance(self._space, ParameterSpace):
-            lines = [part.borders for part in self._space.bins.values()]
-            self._borders = torch.full((len(lines), self._shape[1] - 1), torch.inf).double()
-            for row, line in zip(self._borders, lines, strict=True):
-                row[: len(line)] = line
         self._clear()
 
     def count(self, levels: Levels) -> None:
         """Counts levels [K, n] that were handed out."""
         self._proposed += levels.shape[1]
-        if self._texts:
-            cells = (self._bins(levels) + self._firsts).flatten()
-            self._drawn += cells.bincount(minlength=self._drawn.numel()).reshape(self._shape)
+        for name, bins in self._bins(levels).items() if self._texts else ():
+            self._drawn[name] += bins.bincount(minlength=len(self._texts[name]))
 
     def returned(self, tickets: int, returns: Any, success: Any = None) -> None:
         """Counts the results of tickets, numbers or arrays."""
@@ -71,10 +63,8 @@ class Tally:
             "mean_return": means.get("return"),
             "mean_success": means.get("success"),
             "drawn": {
-                name: dict(zip(texts, counts, strict=False))  # there is no bin behind the last
-                for (name, texts), counts in zip(
-                    self._texts.items(), self._drawn.tolist(), strict=True
-                )
+                name: dict(zip(texts, self._drawn[name].tolist(), strict=True))
+                for name, texts in self._texts.items()
             },
         }
         self._clear()
@@ -83,22 +73,26 @@ class Tally:
     def _clear(self) -> None:
         self._proposed = self._returned = self._dropped = 0
         self._sums: dict[str, tuple[float, int]] = {}
-        self._drawn = torch.zeros(self._shape, dtype=torch.int64)
+        self._drawn = {
+            name: torch.zeros(len(t), dtype=torch.int64) for name, t in self._texts.items()
+        }
 
-    def _bins(self, levels: Levels) -> Tensor:
-        """Returns the bin of each of levels [*B] along each axis: int64 [axes, n]."""
+    def _bins(self, levels: Levels) -> dict[str, Tensor]:
+        """Returns the bin of each of levels [*B] along each axis, int64 [n] by its name."""
         space = self._space
         if isinstance(space, ParameterSpace):
-            values = torch.stack([levels[name].double().flatten() for name in space.bins])
-            return torch.searchsorted(self._borders, values.cpu())
+            return {
+                name: torch.searchsorted(part.borders, levels[name].double().flatten().cpu())
+                for name, part in space.bins.items()
+            }
         if isinstance(space, Items):
             parts = _parts(space)
-            items = levels["item"].cpu().reshape(1, -1)
-            return (items * parts // space.size).clamp(0, parts - 1)
+            items = levels["item"].cpu().flatten()
+            return {"item": (items * parts // space.size).clamp(0, parts - 1)}
         places, own = space.coordinates.double(), space.locate(levels).cpu().double()
         nearest = torch.cdist(own.flatten(0, -2), places).argmin(-1)
         sizes = [len(values) for values in space.axes.values()]
-        return torch.stack(torch.unravel_index(nearest, sizes))
+        return dict(zip(space.axes, torch.unravel_index(nearest, sizes), strict=True))
 
 
 def _bin_texts(space: Any) -> dict[str, list[str]]:

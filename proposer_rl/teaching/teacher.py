@@ -358,9 +358,7 @@ class Teacher:
                 "proposed": list(self._whole),
                 "block": None if self._block is None else self._block.start,
                 "at": self._at,
-                "rollout": {}
-                if kept is None
-                else {"shape": list(kept.batch_size), "kept": packed(kept)},
+                "rollout": None if kept is None else packed(kept),
             }
 
     @torch.inference_mode(False)
@@ -391,10 +389,8 @@ class Teacher:
             blocks = {block.start: block for block in self._ledger.blocks}
             self._block, self._tally = None, Tally(self.space)
             self._use(blocks.get(state["block"]), self._at)
-            self._kept = None
-            if kept := state["rollout"]:
-                steps = TensorDict.from_dict(dict(kept["kept"]), batch_size=kept["shape"])
-                self._kept = steps.flatten()
+            kept = state["rollout"]
+            self._kept = None if kept is None else TensorDict.from_dict(dict(kept), batch_dims=1)
 
     def diverge(self, number: int) -> None:
         """Makes this teacher propose other levels, from the next one on, than its copies do.

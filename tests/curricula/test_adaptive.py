@@ -26,7 +26,6 @@ from proposer_rl.curricula.adaptive import (
     FLOOR,
     HIGH,
     LARGE,
-    LOGGED,
     LOW,
     TARGET,
     UNIFORM,
@@ -35,7 +34,7 @@ from proposer_rl.curricula.adaptive import (
     assigned,
     together,
 )
-from proposer_rl.settings import ArgumentError
+from proposer_rl.curricula.outcome_model import LOGGED
 from proposer_rl.streams import Streams
 from proposer_rl.task import level_inputs
 
@@ -158,16 +157,6 @@ def test_assignments_cost_as_little_as_the_best_of_all() -> None:
         assert float(costs[range(3), found].sum()) == pytest.approx(float(best))
 
 
-def test_thousands_at_once_are_mastered_too_and_all_different() -> None:
-    curriculum = AdaptiveMixture(LINE, LINE.target)
-    teach(curriculum, below(0.5), 12)
-    batch, _ = following(curriculum, 8 * LARGE)
-    x = batch.levels["x"][0][batch.notes["arm"][0] == WAY]
-    assert len(x) > LARGE and len(x.unique()) == len(x)
-    assert (batch.notes["predicted"][0][batch.notes["arm"][0] == WAY] >= 0.3 - 1e-9).all()
-    assert float(x.mean()) > 0.35 > float(x.amin()) and float(x.amax()) < 0.7
-
-
 @pytest.mark.parametrize(
     ("sizes", "parts", "expected"),
     [
@@ -189,12 +178,14 @@ def test_parts_of_large_batches_are_learned_from_together(
     assert torch.cat([part["at"] for part, _ in joined], 1)[1].equal(torch.arange(sum(parts)))
 
 
-def test_the_way_is_mastered_and_nearer_to_the_target_than_uniform_levels() -> None:
+@pytest.mark.parametrize("count", [64, 8 * LARGE])
+def test_the_way_is_mastered_and_nearer_to_the_target_than_uniform_levels(count: int) -> None:
+    """Also where thousands are assigned in blocks: none of them comes twice."""
     curriculum = AdaptiveMixture(LINE, LINE.target)
     teach(curriculum, below(0.5), 12)
-    batch, _ = following(curriculum, 64)
+    batch, _ = following(curriculum, count)
     arm, p, x = batch.notes["arm"][0], batch.notes["predicted"][0], batch.levels["x"][0]
-    assert (arm == WAY).sum() > 10
+    assert len(x[arm == WAY].unique()) == (arm == WAY).sum() > count / 8
     assert (p[arm == WAY] >= 0.3 - 1e-9).all()
     assert (x[arm == TARGET] == 1).all()
     assert float(x[arm == WAY].mean()) > 0.35 > float(x[arm == WAY].amin())
@@ -283,13 +274,8 @@ def draw(n: int, generator: torch.Generator) -> Tensor:
     return torch.rand(n, 2, generator=generator)
 
 
-@pytest.mark.parametrize("made", [False, True])
-def test_inputs_that_are_no_numbers_are_refused(made: bool) -> None:
-    space: Any = prl.LevelGenerator(draw, features=lambda levels: levels / 0)
-    if made:
-        make = lambda values, generator: draw(len(values), generator)  # noqa: E731
-        features = lambda levels: levels / 0  # noqa: E731
-        space = prl.MadeLevels({"x": (0.0, 1.0)}, make, features=features)
+def test_inputs_that_are_no_numbers_are_refused() -> None:
+    space = prl.LevelGenerator(draw, features=lambda levels: levels / 0)
     with pytest.raises(ValueError, match=r"^inputs: \d+ of \d+ numbers are not finite$"):
         prl.Teacher("adaptive_mixture", space).propose(8)
 
@@ -394,8 +380,6 @@ MANY = {f"p{i}": (0.0, 1.0) for i in range(12)}
     [
         prl.Parameters(PARTS, target={"range": 5.0, "texts": "c"}),
         prl.Parameters(PARTS, target={"range": 5.0}, seeded=True),
-        prl.Parameters({"one": [4]}, target={"one": 4}),
-        prl.Parameters({"texts": ["a", "b"]}, target={"texts": "b"}),
         prl.Parameters(MANY, bins=1, target=dict.fromkeys(MANY, 1.0)),
         LINE,
         prl.Parameters({"x": (0.0, 1.0)}),
@@ -420,11 +404,6 @@ def test_any_space_will_do_with_a_target_or_without(space: Any) -> None:
     shares = teacher.log()["shares"]
     assert ("target" in space.distributions) == (shares["target"][0] > 0)
     assert sum(share for (share,) in shares.values()) == pytest.approx(1)
-
-
-def test_a_target_outside_of_the_space_is_refused() -> None:
-    with pytest.raises(ArgumentError, match=r"^target.x=2.0: must lie within 0 to 1$"):
-        prl.Teacher("adaptive_mixture", prl.Parameters({"x": (0.0, 1.0)}, target={"x": 2.0}))
 
 
 class Learner:

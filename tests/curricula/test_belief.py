@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 
 import numpy as np
 import pytest
@@ -177,16 +176,6 @@ def test_the_variance_among_items_is_learnt() -> None:
         assert float(belief._apart.sqrt()) == pytest.approx(apart, rel=0.4)
 
 
-def test_a_hundred_thousand_items_cost_less_than_five_microseconds_each() -> None:
-    belief = Belief(24, items=100_000)
-    x, items = draws(64, 24), torch.arange(64) * 1000
-    begun = time.process_time()
-    for _ in range(4):
-        belief.grow_older()
-        belief.observe(x, torch.ones(64).double(), items)
-    assert time.process_time() - begun < 4 * 0.5
-
-
 def test_without_data_nothing_is_known() -> None:
     belief = Belief(3, items=5)
     p = belief.predict(draws(5, 3), torch.arange(5))
@@ -225,15 +214,3 @@ def test_predictions_of_a_learner_that_moves_are_calibrated() -> None:
         inside = (p >= low) & (p < low + 0.2)
         error = (p[inside].mean() - y[inside].mean()).abs()
         assert error < 0.05 + 3 * math.sqrt(0.25 / int(inside.sum()))
-
-
-def test_a_state_goes_on_as_if_nothing_had_happened() -> None:
-    x, labels, items = draws(20, 2), draws(20, seed=1).gt(0).double(), torch.arange(20)
-    one = Belief(2, items=20)
-    one.observe(x, labels, items)
-    other = Belief(2, items=20)
-    other.load_state_dict(one.state_dict())
-    for belief in (one, other):
-        belief.grow_older()
-        belief.observe(x.flip(0), labels, items.flip(0))
-    assert torch.equal(one.predict(x), other.predict(x))

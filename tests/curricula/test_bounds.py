@@ -129,18 +129,3 @@ def test_on_bins_it_goes_from_the_start_to_where_the_student_fails() -> None:
     assert last[0].max() == 8 and 5 <= int(last[1].max()) <= 6 and last.min() == 0
     assert told["width"][0] == 2.0 and 1.25 <= told["width"][1] <= 1.5
     assert sum(told["histogram"]) == 2 * 40 * 24
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"start": {"c": 0.0}}, "^start.c: unknown; there are: a, b$"),
-        ({"start": {"a": 2.0}}, "^start.a=2.0: input should be less than or equal to 1$"),
-        ({"step": 0.0}, "^step=0.0: input should be greater than 0$"),
-        ({"boundary": 0.0}, "^boundary=0.0: input should be greater than 0$"),
-        ({"episodes": 0}, "^episodes=0: input should be"),
-    ],
-)
-def test_what_is_out_of_bounds_is_named(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(prl.ArgumentError, match=message):
-        BoundsCurriculum(SPACE, **options)

@@ -19,19 +19,13 @@ from proposer_rl.curricula import (
     Inbox,
     LearnedCurriculum,
     Mixed,
-    SamplingCurriculum,
     Schedule,
     Student,
-    TaskStudent,
 )
-from proposer_rl.curricula.batches import fresh_levels
-from proposer_rl.curricula.buffer import level_keys
 from proposer_rl.curricula.combinators import draw_without_replacement
 from proposer_rl.streams import Streams
-from tests.curricula.living import TASK, live, solvers
-from tests.curricula.made import LEARNED, filtered, learnt
+from tests.curricula.living import TASK
 from tests.curricula.scripted import GivenScores
-from tests.tiny import evaluate
 
 P, T = TASK.batch_size, 8
 INF = float("inf")
@@ -71,35 +65,6 @@ def test_what_has_no_score_is_drawn_last_and_evenly() -> None:
     assert (index[:, 0] == 1).all()
     counts = index[:, 1].bincount(minlength=4)
     assert counts[1] == 0 and ((counts[[0, 2, 3]] - 2000).abs() < 200).all()
-
-
-def test_the_coldest_filter_keeps_the_most_learnable() -> None:
-    curriculum = filtered(SamplingCurriculum(TASK.space), times=8)
-    curriculum._temperature = 1e-9
-    learner, streams = solvers([0, 1]), [Streams(seed, "update", 0) for seed in (0, 1)]
-    student = TaskStudent(TASK, learner)
-    batch = curriculum.propose(student, P, streams)
-    candidates = fresh_levels(TASK.space, 8 * P, streams, "levels")
-    keys, kept = level_keys(candidates), level_keys(batch.levels)
-    for copy in (0, 1):
-        row = evaluate(solvers([copy]).agent, candidates[copy])["success"][0].tolist()
-        best = sorted(range(8 * P), key=lambda i: -row[i] * (1 - row[i]))[:P]
-        assert sorted(kept[copy].tolist()) == sorted(keys[copy, best].tolist())
-    assert (student.frames, student.evaluations) == (0, 8 * P)
-
-
-def test_scores_from_episodes_cost_frames() -> None:
-    lived = live(filtered(SamplingCurriculum(TASK.space), "episodes"), solvers([0]), [0], range(2))
-    assert lived.frames == [2 * 3 * P * T] * 2 and lived.evaluations == [0, 0]
-
-
-def test_a_proposers_student_trains_on_some_of_its_proposals() -> None:
-    plain, some = learnt(), filtered(learnt(), times=4)
-    batch = some.propose(TaskStudent(TASK, solvers([0])), P, [Streams(0)])
-    many = plain.propose(TaskStudent(TASK, solvers([0])), 4 * P, [Streams(0)])
-    assert set(level_keys(batch.levels)[0].tolist()) <= set(level_keys(many.levels)[0].tolist())
-    assert some.trains_replicas and some.learnt().keys() == {"proposer", "observed"}
-    assert not filtered(LEARNED["frozen"]()).trains_replicas
 
 
 class Numbered(Curriculum):
@@ -203,12 +168,6 @@ def test_a_schedule_changes_at_the_exact_batch_and_gives_back_to_whom_it_came_fr
     assert stages[1].seen == [[11], [5.5]]
     assert curriculum.learnt() == {"first": 20}
     assert curriculum.log() == {"seen": stages[2].seen}
-
-
-def test_a_schedule_trains_replicas_where_a_stage_does() -> None:
-    plain = SamplingCurriculum(TASK.space)
-    assert not Schedule([plain, Noted(0)], [1]).trains_replicas
-    assert Schedule([plain, learnt()], [1]).trains_replicas
 
 
 @pytest.mark.parametrize(("count", "shares"), [(8, [4, 2, 2]), (3, [2, 0, 1]), (1, [0, 1, 0])])

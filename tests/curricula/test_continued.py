@@ -150,20 +150,6 @@ def test_what_an_episode_gives_does_not_depend_on_those_beside_it() -> None:
     torch.testing.assert_close(found_norms, torch.cat(norms, 1), rtol=1e-4, atol=1e-5)
 
 
-def test_rollouts_go_on_where_the_last_one_ended() -> None:
-    learner = TASK.learner([Streams(seed) for seed in SEEDS])
-    learner.env.set_levels(torch.stack([TASK.evaluated_on["target"][:P]] * K))
-    generators = [torch.Generator().manual_seed(seed) for seed in SEEDS]
-    first, second = (learner.collect(generators) for _ in range(2))
-    last = first["next"][:, :, -1]
-    going_on = ~last["done"].squeeze(-1)
-    assert going_on.any()
-    assert torch.equal(second["observation"][:, :, 0][going_on], last["observation"][going_on])
-    learner.restore(learner.snapshot())  # begins anew
-    third = learner.collect(generators)
-    assert torch.equal(third["observation"][:, :, 0], first["observation"][:, :, 0])
-
-
 def test_a_memory_goes_on_with_its_episode() -> None:
     """Two rollouts are one of twice the length."""
     halves, whole = (

@@ -39,7 +39,7 @@ EVERY = {**MADE, **LEARNED}
 every = pytest.mark.parametrize("make", EVERY.values(), ids=EVERY)
 # What differs from another in a score alone, or in where that comes from, remembers the same.
 SCORES = {
-    *("easy", "regret", "plr of regret", "accel of regret", "gradients"),
+    *("easy", "regret", "plr of regret", "gradients"),
     *("policy gradients", "sfl from episodes", "filtered from episodes", "filtered perf_gain"),
     *("filtered paired", "filtered schedule", "alp_gmm, exact", "synchronous"),
 }

@@ -152,24 +152,6 @@ def test_scores_are_mean_inner_products_with_the_target_direction() -> None:
     assert not torch.allclose(far.state_dict()["scores"]["score"], each.mean(-1), rtol=0.05)
 
 
-def test_a_solvers_batch_depends_on_its_own_stream_alone() -> None:
-    both, alone = learner(2), learner(1)
-    alone.restore(both.snapshot()[1:])
-    together = mazes().propose(taught(Mazes(), both), P, streams(0, 5, 6)).levels
-    by_itself = mazes().propose(taught(Mazes(), alone), P, streams(0, 6)).levels
-    assert (together[1] == by_itself[0]).all()
-    assert not (together[0] == together[1]).all()
-
-
-def test_scoring_passes_are_counted() -> None:
-    curriculum, solvers, costs = mazes(every=2), learner(), []
-    for update in range(3):
-        student = taught(Mazes(), solvers)
-        curriculum.propose(student, P, streams(update, 0, 1))
-        costs.append((student.frames, student.evaluations))
-    assert costs == [(0, 8 + 2 * 3 * BINS), (0, 0), (0, 8 + 2 * 3 * BINS)]
-
-
 def test_the_log_has_standard_errors_and_how_even_the_shares_are() -> None:
     curriculum, solvers = mazes(), learner()
     curriculum.propose(taught(Mazes(), solvers), P, streams(0, 0, 1))

@@ -77,13 +77,6 @@ def test_a_mixture_has_the_least_aic() -> None:
         torch.testing.assert_close(found[order], expected, atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("seed", [0, 7])
-def test_equal_generators_give_equal_mixtures(seed: int) -> None:
-    points = torch.rand(60, 3, generator=torch.Generator().manual_seed(2))
-    one, again = (fit_mixture(points, 4, Streams(seed).generator("mixture")) for _ in range(2))
-    assert all(map(torch.equal, one, again))
-
-
 def test_points_that_are_all_alike_make_a_mixture_without_a_warning(
     recwarn: pytest.WarningsRecorder,
 ) -> None:
@@ -149,36 +142,6 @@ def test_the_mass_moves_to_what_is_learnt_and_leaves_when_it_is(source: str) -> 
     assert np.mean(shares[:8]) == pytest.approx(even, abs=0.15)
     assert np.mean(shares[14:30]) > 2 * even
     assert np.mean(shares[40:]) < np.mean(shares[14:30]) / 2
-
-
-def test_a_difference_between_bins_is_no_progress() -> None:
-    task = Scripted(torch.tensor([[0.0, 1.0, 0.0, 1.0]]), batch_size=64)
-    curriculum = small(task)
-    for update in range(3):
-        step(curriculum, task, update)
-    curriculum.log()
-    history = curriculum.state_dict()["history"]
-    assert len(history["tasks"][0, :64].unique()) == 4  # all have been played
-    assert history["progress"].abs().max() == 0
-
-
-def test_a_return_changes_the_record_of_its_own_task_only() -> None:
-    task = Scripted(torch.rand(2, 8, generator=torch.Generator().manual_seed(5)), batch_size=16)
-    histories = []
-    for changed in (False, True):
-        curriculum = small(task)
-        for update in range(3):
-            streams = [Streams(seed, update) for seed in (0, 1)]
-            batch = curriculum.propose(task, 16, streams)
-            returns = task.skills.gather(1, batch.levels)
-            if changed and update == 2:
-                returns[1, 3] += 5
-            curriculum.observe(task, batch, reached(returns))
-        curriculum.log()  # what was observed is taken in
-        histories.append(curriculum.state_dict()["history"])
-    assert torch.equal(histories[0]["points"], histories[1]["points"])
-    for name in ("returns", "progress"):
-        assert (histories[0][name] != histories[1][name]).nonzero().tolist() == [[1, 2 * 16 + 3]]
 
 
 def test_progress_is_against_earlier_updates_alone() -> None:

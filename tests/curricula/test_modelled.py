@@ -114,30 +114,6 @@ def test_whole_batches_are_taken_in_one_by_one() -> None:
     assert same(curriculum._model.state_dict(), model.state_dict())
 
 
-def test_a_log_read_between_two_parts_of_a_batch_makes_the_model_no_older() -> None:
-    student = Scripted(torch.tensor([[0.0, 0.3, 0.7, 1.0]]))
-    quiet, logged = scripted_filter(student), scripted_filter(student)
-    for update in range(4):
-        outcome = reached(torch.rand(1, 16, generator=torch.Generator().manual_seed(update)))
-        for curriculum in (quiet, logged):
-            batch = curriculum.propose(student, 16, [Streams(0, "update", update)])
-            for part in (slice(0, 6), slice(6, 16)):
-                curriculum.observe(student, batch[:, part], outcome[:, part])
-                if curriculum is logged:
-                    curriculum.log()
-    quiet.log()
-    assert same(quiet._model.state_dict(), logged._model.state_dict())
-
-
-def test_it_takes_a_student_of_whom_nothing_is_known_but_what_it_did() -> None:
-    student = Scripted(torch.tensor([[0.0, 1.0]]))
-    curriculum = scripted_filter(student)
-    assert curriculum.needs == ()
-    batch = curriculum.propose(Student(), 3, [Streams(0)])
-    curriculum.observe(Student(), batch, reached(torch.zeros(1, 3)).exclude("success"))
-    curriculum.propose(Student(), 3, [Streams(1)])
-
-
 def test_success_that_is_not_needed_may_be_told_of_some_levels_alone() -> None:
     """In parts of a batch, and in some batches: it makes no difference."""
     skills = torch.tensor([[0.0, 0.2, 0.8, 1.0]])

@@ -116,22 +116,6 @@ def test_few_outcomes_say_little(count: int) -> None:
     assert (told["success"][0, :count] < 0.5).all()
 
 
-def test_a_constant_feature_is_a_further_intercept() -> None:
-    """Constants 1 and c are one, sqrt(1 + c^2): the penalty is the same all round."""
-    features, labels, _ = (entry[0] for entry in rows())
-    one = torch.ones(len(features), 1, dtype=features.dtype)
-    told = [
-        model_of(phi, labels).predict(phi[None])["success"]
-        for phi in (
-            torch.cat([features, one, 3 * one], -1),
-            torch.cat([features, math.sqrt(10) * one], -1),
-            torch.cat([features, math.sqrt(10) * one, 0 * one], -1),
-        )
-    ]
-    torch.testing.assert_close(told[0], told[1])
-    torch.testing.assert_close(told[2], told[1])
-
-
 def test_the_mean_of_returns_is_found() -> None:
     """A return of 40 + 10 x, give or take 5 (1 + x): the more rows, the nearer."""
     g = torch.Generator().manual_seed(0)
@@ -156,36 +140,6 @@ def test_a_return_above_the_worst_is_a_success_where_all_failures_are_alike() ->
     assert (model.labels({"return": returns}) == success).all()
     model.add(torch.ones(1, 5, 1).double(), {"return": returns})
     assert (model.labels({"return": returns[:, 2:]}) == 1).all()  # of all that is remembered
-
-
-def phi_of(x: Tensor) -> Tensor:
-    return torch.stack([torch.ones_like(x), x, x.square()], -1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("speed", [0.02, 0.08])
-def test_it_follows_a_learner_whose_success_moves(speed: float) -> None:
-    """A skill that grows, and levels of difficulties x in [-1, 1] that take it.
-
-    As near to the law as one logistic regression of the present law would be on ten batches, and
-    much nearer than one on the same rows that knows of no age.
-    """
-    g, at = torch.Generator().manual_seed(1), torch.linspace(-1, 1, 41).double()
-    model, seen, off, off_without_age, count = OutcomeModel(labels="success"), [], 0.0, 0.0, 0
-    for skill in torch.arange(-1, 1, speed).double():
-        law = lambda x, skill=skill: (6 * (skill - x)).sigmoid()  # noqa: E731
-        x = 2 * torch.rand(1, 32, generator=g, dtype=torch.float64) - 1
-        solved = (torch.rand(x.shape, generator=g) < law(x)).double()
-        model.add(phi_of(x), {"return": solved, "success": solved})
-        seen = [*seen, (phi_of(x), solved)][-48:]
-        phi, labels = (torch.cat(entries, 1) for entries in zip(*seen, strict=True))
-        age = torch.arange(len(seen) - 1, -1, -1).repeat_interleave(32).double() / 12
-        plain = logistic_ridge(phi, labels, 0.5 ** age[None], 0.3)[0][0]
-        off += float((model.predict(phi_of(at)[None])["success"][0] - law(at)).abs().mean())
-        off_without_age += float(((phi_of(at) @ plain).sigmoid() - law(at)).abs().mean())
-        count += 1
-    assert off / count < 0.05
-    assert off < off_without_age / 2
 
 
 def test_on_mazes_it_ranks_levels_by_their_exact_success_the_better_the_more_it_has_seen() -> None:

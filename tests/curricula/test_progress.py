@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 
-from proposer_rl.curricula.progress import LearningProgressCurriculum, progress_shares
+from proposer_rl.curricula.progress import LearningProgressCurriculum
 from proposer_rl.streams import Streams
 from proposer_rl.task import NoSuccessError
 from tests.curricula.scripted import Scripted, reached, step
@@ -56,13 +54,6 @@ def test_a_first_look_shows_no_progress_and_all_bins_are_alike() -> None:
     assert step(curriculum, task, 0)[0].bincount(minlength=N).tolist() == [2] * N
 
 
-@given(st.lists(st.floats(0, 1, width=32), min_size=2, max_size=8), st.floats(0, 1))
-def test_shares_are_a_distribution_with_a_floor(progress: list[float], exploration: float) -> None:
-    shares = progress_shares(torch.tensor([progress]), exploration)
-    torch.testing.assert_close(shares.sum(), torch.tensor(1.0))
-    assert (shares >= exploration / len(progress) - 1e-6).all()
-
-
 @pytest.mark.parametrize("source", ["exact", "episodes"])
 def test_the_mass_moves_to_what_is_learnt_and_leaves_when_it_is(source: str) -> None:
     """The last two bins: one is learnt from update 10 to 29; the other never changes."""
@@ -81,28 +72,6 @@ def test_the_mass_moves_to_what_is_learnt_and_leaves_when_it_is(source: str) -> 
     # All that is left at the end is what the averages still remember of it.
     told = torch.tensor(curriculum.log()["score"])
     assert told[0, 2] < 1e-2 and (told[0, [0, 1, 3]] == 0).all()
-
-
-def test_mass_leaves_a_plateau_for_what_is_learnt_next() -> None:
-    task = Scripted(torch.zeros(1, N), batch_size=40)
-    curriculum = LearningProgressCurriculum(task.space, fast=0.7, slow=0.9)
-    shares = []
-    for update in range(60):
-        task.skills = torch.tensor([[0.0, 0.0, min(update, 20) / 20, 0.0]])
-        task.skills[0, 1] = max(update - 40, 0) / 20
-        step(curriculum, task, update)
-        shares.append(curriculum.shares()[0])
-    assert shares[15][2] > 0.8 and shares[15][1] == pytest.approx(0.05)
-    assert shares[59][1] > 0.7 and shares[59][2] < 0.1
-
-
-def test_progress_is_seen_in_either_direction() -> None:
-    task = Scripted(torch.tensor([[0.5, 0.5, 0.5, 0.5]]))
-    curriculum = LearningProgressCurriculum(task.space, exploration=0.0, measure="return")
-    step(curriculum, task, 0)
-    task.skills = torch.tensor([[0.5, 0.9, 0.1, 0.5]])
-    step(curriculum, task, 1)
-    torch.testing.assert_close(curriculum.shares(), torch.tensor([[0.0, 0.5, 0.5, 0.0]]))
 
 
 def test_probes_are_fixed_counted_and_each_students_own() -> None:

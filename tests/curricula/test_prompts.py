@@ -187,11 +187,3 @@ def test_each_item_comes_once_and_all_as_often() -> None:
     assert places.bincount().tolist() == [2, 2, 2, 1]
     ties = torch.stack([nearest(torch.zeros(4), 2, g) for _ in range(400)])
     assert (ties.flatten().bincount() / 200 - 1).abs().max() < 0.25
-
-
-@pytest.mark.parametrize("name", ["mopps", "arc_length"])
-def test_a_hundred_thousand_items_cost_little(name: str) -> None:
-    """Half a second is five microseconds an item; this is a fraction of it."""
-    teacher = prl.Teacher(name, prl.Items(100_000), block=64)
-    places = teacher.propose(64)
-    assert len(places.unique()) == 64

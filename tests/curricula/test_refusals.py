@@ -12,6 +12,7 @@ import torch
 import proposer_rl as prl
 from proposer_rl.curricula import (
     AdaptiveDifficulty,
+    AdaptiveMixture,
     ArcLengthFilter,
     BetaSampling,
     BoundsCurriculum,
@@ -23,85 +24,46 @@ from proposer_rl.curricula import (
     LearningProgressCurriculum,
     Mixed,
     MixtureCurriculum,
+    Modelled,
     ReplayCurriculum,
     ReplayRule,
     RowsCurriculum,
     SamplingCurriculum,
     Schedule,
     Scorer,
-    SomeBins,
+    SelectionCurriculum,
+    SelfPacedCurriculum,
     TransportCurriculum,
 )
 from proposer_rl.meta.actions import Mixture
 from proposer_rl.settings import ArgumentError
 from proposer_rl.tasks.parameters import ParameterSpace, intervals
-from tests.curricula.made import SETTINGS, SPACE, TARGET, problem_agent, replay, selection
+from tests.curricula.made import SETTINGS, SPACE, TARGET, problem_agent, replay
 from tests.curricula.scripted import GivenScores
-from tests.tiny import TASK
 
 TWO: list[Curriculum] = [SamplingCurriculum(SPACE)] * 2
-progress = partial(LearningProgressCurriculum, SPACE)
-transport = partial(TransportCurriculum, SPACE, TASK.target_shares)
 gaussians = partial(MixtureCurriculum, SPACE, refit=64, warmup=64)
-first_order = partial(FirstOrderCurriculum, SPACE, TARGET)
-proposer = partial(FirstOrderProposer, SPACE, TARGET, problem_agent(), SETTINGS)
-keep = partial(Filtered, TWO[0], GivenScores(torch.zeros(1, 1)))
+bounds, rows = partial(BoundsCurriculum, SPACE), partial(RowsCurriculum, SPACE)
+one_row = partial(RowsCurriculum, prl.Parameters({"row": (0.0, 1.0)}, bins=1))
 ONE_RATE = prl.Items(2, pass_rates=[0.5, float("nan")])
 no_edits = partial(ReplayCurriculum, SPACE, Scorer("positive_value_loss", "episodes"))
 
 REFUSED: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
-    (progress, {"every": 0}, "every=0: input should be greater than or equal to 1"),
-    (progress, {"every": 1.5}, "every=1.5: input should be a valid integer"),
-    (progress, {"probes": 10**30}, "probes=1000"),
-    (progress, {"probes": True}, "probes=True: input should be a valid integer"),
-    (progress, {"source": "dreams"}, "source='dreams': input should be 'exact' or 'episodes'"),
-    (progress, {"measure": None}, "measure=None: input should be 'success' or 'return'"),
-    (progress, {"fast": 1.0}, "fast=1.0: input should be less than 1"),
-    (progress, {"slow": -0.1}, "slow=-0.1: input should be greater than or equal to 0"),
-    (progress, {"exploration": float("nan")}, "exploration=nan: input should be"),
-    (progress, {"exploration": "all"}, "exploration='all': input should be a valid number"),
-    (transport, {"epsilon": 0.0}, "epsilon=0.0: input should be greater than 0"),
-    (transport, {"delta": float("inf")}, "delta=inf: input should be a finite number"),
-    (transport, {"probes": 0}, "probes=0: input should be greater"),
-    (transport, {"measure": "joy"}, "measure='joy': input should be 'success' or 'return'"),
-    (gaussians, {"source": "both"}, "source='both': input should be 'episodes' or 'exact'"),
-    (gaussians, {"components": 1}, "components=1: input should be greater than or equal to 2"),
-    (gaussians, {"warmup": None}, "warmup=None: input should be a valid integer"),
-    (gaussians, {"exploration": 1.1}, "exploration=1.1: input should be less than or equal to 1"),
     (gaussians, {"components": 65}, "components=65: must be at most refit=64, and that at most"),
     (gaussians, {"warmup": 63}, "components=10: must be at most refit=64, .* at most warmup=63"),
-    (first_order, {"temperature": 0.0}, "temperature=0.0: input should be greater than 0"),
-    (first_order, {"step": 0.0}, "step=0.0: input should be greater than 0"),
-    (first_order, {"smoothing": 1.0}, "smoothing=1.0: input should be less than 1"),
-    (first_order, {"candidates": 0}, "candidates=0: input should be greater"),
-    (first_order, {"measure": "luck"}, "measure='luck': input should be 'log_success' or 'return'"),
-    (proposer, {"step": -1.0}, "step=-1.0: input should be greater than 0"),
-    (proposer, {"target_levels": 0}, "target_levels=0: input should be greater"),
-    (selection, {"new": -0.1}, "new=-0.1: input should be greater than or equal to 0"),
-    (replay, {"capacity": "lots"}, "capacity='lots': input should be a valid integer"),
-    (replay, {"fill": 0.0}, "fill=0.0: input should be greater than 0"),
-    (replay, {"replay_probability": 0}, "replay_probability=0: input should be greater than 0"),
-    (replay, {"edits": -1}, "edits=-1: input should be greater than or equal to 0"),
-    (replay, {"renew": "no"}, "renew='no': input should be a valid boolean"),
-    (replay, {"parents": "hard"}, "parents='hard': input should be 'batch' or 'easy'"),
+    (bounds, {"start": {"place": 0.0}}, "start.place: unknown; there are: obstacle fraction, path"),
+    (bounds, {"lower": 0.6}, "lower=0.6: must be at most upper=0.5"),
+    (rows, {"lower": 0.6}, "lower=0.6: must be at most upper=0.5"),
+    (rows, {"row": "level"}, "row=level: unknown; there are: obstacle fraction, path length"),
+    (one_row, {}, "row=row: has a single row; give it bins"),
+    (replay, {"train_on_new": True, "synchronous": True}, "train_on_new=true, synchronous=true: "),
+    (replay, {"co_learnability": 1.0, "renew": True}, r"co_learnability=1\.0, renew=true: "),
     (no_edits, {"edits": 1}, "edits=1: the task has no edit"),
-    (ReplayRule, {"temperature": 0.0}, "temperature=0.0: input should be greater than 0"),
-    (ReplayRule, {"staleness": 1.5}, "staleness=1.5: input should be less than or equal to 1"),
-    (ReplayRule, {"best": 0}, "best=0: input should be greater than or equal to 1"),
-    (ReplayRule, {"prioritization": "luck"}, "prioritization='luck': input should be 'rank', 'pro"),
-    (Scorer, {"score": "luck", "source": "exact"}, r"score='luck': from source=exact there are \["),
-    (Scorer, {"score": "regret", "source": "oracle"}, "source='oracle': input should be"),
-    (partial(SomeBins, SPACE), {"values": {"walls": [1]}}, r"values.walls=\[1.0\]: must be among"),
-    (partial(SomeBins, SPACE), {"values": {"path length": [3]}}, r"values.path length=\[3.0\]"),
-    (partial(SomeBins, SPACE), {"values": {"path length": []}}, r"values.path length=\[\]: "),
+    (replay, {"new_levels": {"walls": [1]}}, r"new_levels.walls=\[1.0\]: must be among"),
+    (replay, {"new_levels": {"path length": []}}, r"new_levels.path length=\[\]: "),
     (partial(AdaptiveDifficulty, SPACE), {}, "pass_rates: none: this curriculum needs one of each"),
     (partial(AdaptiveDifficulty, ONE_RATE), {}, "pass_rates: 1 missing: this curriculum needs one"),
-    (partial(AdaptiveDifficulty, ONE_RATE), {"step": 0}, "step=0: input should be greater than 0"),
     (partial(CategoryBandit, ONE_RATE), {}, "features: have no texts: this curriculum needs a cat"),
-    (partial(BetaSampling, SPACE), {"decay": 2}, "decay=2: input should be less than or equal to"),
-    (partial(ArcLengthFilter, SPACE), {"slack": 1}, "slack=1: input should be less than 1"),
-    (keep, {"times": 1}, "times=1: input should be greater than or equal to 2"),
-    (keep, {"temperature": 0.0}, "temperature=0.0: input should be greater than 0"),
     (partial(Mixed, TWO), {"shares": [1.0]}, r"shares=\[1.0\]: 2 curricula need as many"),
     (partial(Mixed, TWO), {"shares": [1.0, -1.0]}, "shares.1=-1.0: input should be greater"),
     (partial(Mixed, TWO), {"shares": [0.0, 0.0]}, "shares=.*, not all of them zero"),
@@ -119,6 +81,21 @@ def test_what_is_out_of_bounds_is_named(
     with pytest.raises(ArgumentError, match=message) as refused:
         make(**options)
     assert "\n" not in str(refused.value)
+
+
+CHECKED = [
+    *(AdaptiveDifficulty, AdaptiveMixture, ArcLengthFilter, BetaSampling, BoundsCurriculum),
+    *(CategoryBandit, Filtered, FirstOrderCurriculum, FirstOrderProposer, Mixed, Modelled),
+    *(LearningProgressCurriculum, MixtureCurriculum, ReplayCurriculum, ReplayRule, Schedule),
+    *(RowsCurriculum, Scorer, SelectionCurriculum, SelfPacedCurriculum, TransportCurriculum),
+]
+
+
+@pytest.mark.parametrize("kind", CHECKED)
+def test_constructors_are_held_to_their_signatures(kind: Any) -> None:
+    """What that refuses is tested in ``test_arguments.py``."""
+    with pytest.raises(ArgumentError, match=r"^sing: unknown; there are: "):
+        kind(sing=1)
 
 
 def test_a_mixture_is_not_filtered() -> None:

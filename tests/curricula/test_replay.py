@@ -12,10 +12,8 @@ from tensordict import TensorDict
 from proposer_rl.cli.build import parts
 from proposer_rl.cli.errors import ConfigError
 from proposer_rl.curricula import ReplayCurriculum, Scorer, Student, TaskStudent, outcome_of
-from proposer_rl.curricula.batches import SomeBins
 from proposer_rl.curricula.buffer import (
     ReplayRule,
-    draw_slots,
     empty_buffer,
     level_keys,
     lineage,
@@ -26,7 +24,6 @@ from proposer_rl.curricula.scores import unseen
 from proposer_rl.learning import PPO, DivergedError
 from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.mazes import planes
 from tests.curricula.living import TASK, live, solvers, student
 from tests.curricula.made import MADE, ncc, replay
 from tests.tiny import composed, evaluate
@@ -40,13 +37,6 @@ def robust(**options: Any) -> ReplayCurriculum:
 
 def accel(**options: Any) -> ReplayCurriculum:
     return replay(edits=3, **options)
-
-
-def test_every_step_of_training_is_on_the_proposed_level() -> None:
-    lived = live(MADE["plr"](), solvers([0]), [0], range(6))
-    for levels, update in zip(lived.levels, lived.updates, strict=True):
-        seen = update.rollout["planes"]
-        assert (seen == planes(levels).unsqueeze(2)).all() and seen.shape[2] == T
 
 
 @pytest.mark.parametrize("name", ["plr", "plr of regret", "plr of regret, renewed"])
@@ -297,28 +287,6 @@ def test_what_is_logged_shows_levels() -> None:
     assert all(TASK.record(some, None) for some in told[-1]["levels"].values())
     assert told[-1]["replayed"] == 1 and len(told[-1]["effective_levels"]) == 2
     assert all(1 <= n <= 16 for n in told[-1]["effective_levels"])
-
-
-def test_a_batch_collapses_at_the_published_temperature() -> None:
-    """128 draws from 4,000 levels at T = 0.3 have about 42 distinct ones, at T = 1 about 102."""
-    buffer = empty_buffer(TASK.space.sample(1, torch.Generator())[0], 1, 4000)
-    generator = torch.Generator().manual_seed(0)
-    buffer["filled"] = torch.ones(1, 4000, dtype=torch.bool)
-    buffer["score"] = torch.rand(1, 4000, generator=generator, dtype=torch.float64)
-    for temperature, distinct, effective in ((0.3, 42, 2.7), (1.0, 102, 96)):
-        rule = ReplayRule(temperature=temperature)
-        drawn = [draw_slots(buffer.clone(), 128, rule, [generator])[0] for _ in range(10)]
-        assert abs(sum(len(slots.unique()) for slots in drawn) / 10 - distinct) < 6
-        shares = 0.7 * score_weights(buffer["score"], buffer["filled"], rule) + 0.3 / 4000
-        assert float(1 / shares.square().sum()) == pytest.approx(effective, rel=0.05)
-
-
-def test_some_bins_are_those_of_the_values() -> None:
-    empty = SomeBins(TASK.space, {"obstacle fraction": [0.0]})
-    levels = empty.sample(50, torch.Generator().manual_seed(0))
-    assert not levels.walls.any()
-    both = SomeBins(TASK.space, {"obstacle fraction": [0.2], "path length": [4]})
-    assert both.bins.tolist() == [3]
 
 
 def test_levels_with_nested_entries_are_restored() -> None:

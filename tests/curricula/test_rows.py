@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from typing import Any
 
 import pytest
 import torch
@@ -31,15 +30,6 @@ def stationary(success: list[float]) -> torch.Tensor:
     total = torch.zeros(rows + 1).double()
     total[-1] = 1
     return torch.linalg.lstsq(balance, total.unsqueeze(1)).solution.squeeze(1)
-
-
-def test_a_perfect_policy_is_in_row_six_of_ten_on_average() -> None:
-    """The j-th row's share is j to 1, so that the mean of R rows from 0 on is 2 (R - 1) / 3."""
-    shares = stationary([1.0] * ROWS)
-    torch.testing.assert_close(shares, torch.arange(1, ROWS + 1) / 55.0, check_dtype=False)
-    assert shares @ torch.arange(ROWS).double() == pytest.approx(6.0)
-    assert shares[-1] == pytest.approx(2 / 11)
-    assert stationary([1.0] * 20) @ torch.arange(20).double() == pytest.approx(2 * 19 / 3)
 
 
 @pytest.mark.parametrize("success", [[1.0] * ROWS, [0.95 - 0.06 * row for row in range(ROWS)]])
@@ -87,23 +77,6 @@ def test_rows_move_as_of_one_robot_after_another() -> None:
     log = curriculum.log()
     assert log["mean_row"] == rows.double().mean(1).tolist()
     assert sum(map(sum, log["histogram"])) == 2 * (20 * 19 - 1)
-
-
-@pytest.mark.parametrize(
-    ("space", "options", "message"),
-    [
-        (SPACE, {"row": "level"}, "^row=level: unknown; there are: speed, row$"),
-        (SPACE, {"start": -1}, "^start=-1: input should be"),
-        (
-            prl.Parameters({"row": (0.0, 1.0)}, bins=1),
-            {},
-            "^row=row: has a single row; give it bins$",
-        ),
-    ],
-)
-def test_what_cannot_be_is_named(space: Any, options: dict[str, Any], message: str) -> None:
-    with pytest.raises(prl.ArgumentError, match=message):
-        RowsCurriculum(space, **options)
 
 
 def test_rows_are_the_first_axis_unless_one_is_called_so() -> None:

@@ -105,12 +105,6 @@ def test_rollouts_are_pooled_by_episodes() -> None:
     assert score("positive_value_loss", played(FIRST), played(SHORT)) == pytest.approx(together)
 
 
-@pytest.mark.parametrize("name", [*STEPWISE, "learnability", "regret"])
-def test_the_same_episodes_again_leave_a_score_as_it_was(name: str) -> None:
-    parts = [FIRST, SHORT, SECOND]
-    assert score(name, played(*parts, *parts)) == pytest.approx(score(name, played(*parts)))
-
-
 lists = st.lists(st.tuples(st.integers(1, 5), st.booleans()), min_size=1, max_size=4)
 
 
@@ -137,13 +131,6 @@ def test_episodes_are_those_of_a_plain_loop(
     assert float(found.total) == pytest.approx(sum(returns), abs=1e-5)
     assert float(found.best) == pytest.approx(max(returns), abs=1e-6)
     torch.testing.assert_close(found.weight.flatten().float(), weight)
-
-
-def test_a_perfect_critic_leaves_nothing_to_learn() -> None:
-    rewards = torch.tensor([-0.01, -0.01, 0.99])
-    values = [float((rewards[t:] * 0.9 ** torch.arange(3 - t)).sum()) for t in range(3)]
-    for name in STEPWISE.keys() - {"max_mc"}:
-        assert score(name, played((rewards.tolist(), values))) == pytest.approx(0, abs=1e-6)
 
 
 def streams(copies: int) -> list[Streams]:

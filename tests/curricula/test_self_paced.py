@@ -150,15 +150,3 @@ def test_levels_are_as_they_are_and_the_target_is_exact() -> None:
         drawn = curriculum.propose(30)["x"]
     assert float(drawn.mean()) == pytest.approx(9.3, abs=0.05)
     assert float(drawn.std()) == pytest.approx(0.05, abs=0.02)  # of a least deviation of 0.01
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"start": {"b": 0.0}}, "^start.b: unknown; there are: place$"),
-        ({"epsilon": 0.0}, "^epsilon=0.0: input should be greater than 0$"),
-    ],
-)
-def test_what_is_out_of_bounds_is_named(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(prl.ArgumentError, match=message):
-        paced(Scripted(torch.zeros(1, 3)), **options)

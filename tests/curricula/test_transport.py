@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import assume, given
-from hypothesis import strategies as st
 
 from proposer_rl.curricula.transport import (
     TransportCurriculum,
@@ -18,12 +16,9 @@ from proposer_rl.curricula.transport import (
 )
 from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components, make
-from proposer_rl.settings import ArgumentError
-from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import SpecificationSpace
 from proposer_rl.tasks.mazes.maze_settings import DistributionSettings, SpaceSettings
 from proposer_rl.tasks.parameters import ParameterSpace, intervals
-from proposer_rl.teaching import Items, Parameters, Teacher
 from tests.curricula.scripted import Scripted, step
 from tests.tiny import tiny_task
 
@@ -67,33 +62,6 @@ def test_no_distribution_of_a_grid_is_better(places: np.ndarray, reach: float, s
     assert left == pytest.approx(squared(p, target, places), abs=1e-6)
     near = [q for q in possible if squared(q, now, places) <= reach**2]
     assert left <= min(squared(q, target, places) for q in near) + 1e-6
-
-
-def shares(size: int) -> st.SearchStrategy[np.ndarray]:
-    numbers = st.lists(st.integers(0, 5), min_size=size, max_size=size).filter(any)
-    return numbers.map(lambda n: np.array(n) / sum(n))
-
-
-@given(st.data())
-def test_what_holds_everywhere(data: st.DataObject) -> None:
-    size = 6
-    axes = np.linspace(-1, 1, 2), np.linspace(-1, 1, 3)
-    places = np.array(list(product(*axes)))
-    costs = ((places[:, None] - places) ** 2).sum(-1)
-    target, now = data.draw(shares(size)), data.draw(shares(size))
-    allowed = np.array(data.draw(st.lists(st.booleans(), min_size=size, max_size=size)))
-    assume(allowed.any())
-    reach = data.draw(st.floats(0.01, 4))
-    p, left = step_towards(target, now, costs, allowed, reach)
-    assert p.sum() == pytest.approx(1) and (p >= 0).all() and (p[~allowed] == 0).all()
-    if allowed[now > 0].all():
-        stay = step_towards(target, now, costs, allowed, 0.0)
-        np.testing.assert_allclose(stay[0], now, atol=1e-5)
-        assert left <= stay[1] + 1e-6  # never farther off than before
-    further = step_towards(target, now, costs, allowed, 10.0)
-    assert further[1] <= left + 1e-6
-    # With all within reach, mass of the target goes to the nearest allowed bins.
-    assert further[1] == pytest.approx(costs[allowed].min(0) @ target, abs=1e-6)
 
 
 def test_from_bins_that_are_lost_the_nearest_ones_are_taken() -> None:
@@ -186,17 +154,6 @@ def test_uniform_draws_end_where_the_target_is_reached() -> None:
     assert counts.tolist() == [0, 0, 0, 75, 25]
 
 
-def test_scoring_passes_are_counted() -> None:
-    task = Scripted(torch.ones(1, 5))
-    found = curriculum(task, every=3, probes=4)
-    costs = []
-    for update in range(4):
-        task.evaluations = 0
-        found.propose(task, 8, [Streams(update)])
-        costs.append(task.evaluations)
-    assert costs == [20, 0, 0, 20]
-
-
 def test_the_mazes_target_is_rounded_to_bins() -> None:
     pairs = [(0.2, 4), (0.05, 2), (0.0, 3), (0.9, 2)]
     task = tiny_task(
@@ -208,11 +165,6 @@ def test_the_mazes_target_is_rounded_to_bins() -> None:
     assert task.space.nearest(pairs).tolist() == [4, 0, 0, 3]
     single = SpecificationSpace((0.1,), (2, 4), height=5, width=5)
     assert single.nearest([(0.0, 4), (0.4, 2)]).tolist() == [1, 0]
-
-
-def test_a_space_finds_its_own_bins() -> None:
-    space = SpecificationSpace((0.0, 0.1, 0.3), (2, 3, 5), height=6, width=6)
-    assert torch.equal(space.nearest(space.specifications), torch.arange(9))
 
 
 def test_a_task_that_does_not_know_where_its_target_is_is_refused() -> None:
@@ -237,15 +189,3 @@ def test_the_nearest_distribution_is_found_where_the_solver_needs_slack(seed: in
     nearest = np.where(allowed, costs, np.inf)
     tied = nearest == nearest.min(1, keepdims=True)
     assert left <= (even * np.where(tied, costs[30], np.inf).min(1)).sum() + 1e-6
-
-
-@pytest.mark.parametrize(
-    ("space", "size"),
-    [
-        (Items(257, target=[0]), "257"),
-        (Parameters({name: (0.0, 1.0) for name in "abcd"}, target={"a": 1.0}), "4,096"),
-    ],
-)
-def test_more_bins_than_a_program_takes_are_refused_before_any_work(space: Any, size: str) -> None:
-    with pytest.raises(ArgumentError, match=f"space: {size} bins: .* on more than .*; give fewer"):
-        Teacher("model_transport", space)

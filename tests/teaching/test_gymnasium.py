@@ -117,24 +117,6 @@ def test_attributes_lie_in_parts_of_the_environment_and_in_arrays() -> None:
     assert (env.ground, env.windy, env.masses) == (level["ground"], True, {"torso": level["mass"]})
 
 
-@pytest.mark.filterwarnings("ignore:set. leaves out")
-@pytest.mark.parametrize(
-    ("sets", "message"),
-    [
-        ({"g": "model.opt.gravity"}, r"set.g='model.opt.gravity': .* shape \[3\]; name one of its"),
-        ({"g": "ground"}, "set.g='ground': ground is no number but a str"),
-        (
-            {"ground": "masses.torso"},
-            "set.ground='masses.torso': .* is a number, 1.0, and no",
-        ),
-        ({"ground": "floor"}, "set.ground='floor': Parts has no attribute 'floor'"),
-    ],
-)
-def test_a_number_is_put_in_the_place_of_one(sets: dict[str, str], message: str) -> None:
-    with pytest.raises(ArgumentError, match=message):
-        parts(**sets)
-
-
 def test_the_length_of_cartpole_is_all_of_what_it_computes_from_it() -> None:
     """As an environment that was built with that length; the example's levels are so."""
     example = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "taught_sb3.py"))
@@ -174,7 +156,6 @@ def test_a_forked_teacher_is_refused() -> None:
     [
         (lambda: cartpole("attributes"), "set='attributes': must be"),
         (lambda: cartpole({"gravity": "gravty"}).reset(), "set.gravity='gravty': CartPoleEnv has"),
-        (lambda: cartpole({"gravity": "a.b"}).reset(), "set.gravity='a.b': CartPoleEnv has no"),
     ],
 )
 def test_what_is_wrong_is_named(make: Any, message: str) -> None:
@@ -210,24 +191,12 @@ def paying(reward: Any) -> gymnasium.Env[Any, Any]:
     return answering(step=lambda self, a: (LevelEnv.step(self, a)[0], reward, True, False, {}))
 
 
-@pytest.mark.parametrize("reward", [0.5, np.array([0.5]), np.array(0.5), torch.tensor([[0.5]])])
-def test_one_number_in_an_array_is_a_reward(reward: Any) -> None:
-    teacher = counted()
-    env = prl.TaughtEnv(paying(reward), teacher, set_level)
-    env.reset()
-    assert type(env.step(0)[1]) is float
-    assert seen(teacher)[0][0] == 0.5
-
-
 @pytest.mark.parametrize(
     ("env", "more", "message"),
     [
-        (paying(np.ones(2)), {}, r"env: the reward must be a number, not array\(\[1., 1.\]\)"),
         (paying({"a": 1.0}), {}, "env: the reward must be a number, not {'a': 1.0}"),
         (paying(np.nan), {}, "env: step pays a reward of nan: it must be finite"),
-        (paying(-np.inf), {}, "env: step pays a reward of -inf: it must be finite"),
         (paying(1.0), {"success": "won"}, "success='won': .* it has, terminated, truncated, or"),
-        (paying(1.0), {"success": lambda last: "yes"}, "success=.*must be a number, not 'yes'"),
         (paying(1.0), {"success": lambda last: None}, "success=.*: gives None of the last info;"),
     ],
 )
@@ -284,15 +253,11 @@ def test_a_parameter_that_the_environment_never_gets_is_told_once() -> None:
     assert len(heard) == 1
 
 
-class Copies(gymnasium.Wrapper[Any, Any, Any, Any]):
+class PutsBack(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Has a gravity of its own."""
 
-    def __init__(self, env: Any) -> None:
-        super().__init__(env)
-        self.gravity = env.unwrapped.gravity
+    gravity = 9.8
 
-
-class PutsBack(Copies):
     def reset(self, **given: Any) -> Any:
         self.unwrapped.gravity = self.gravity  # type: ignore[attr-defined]
         return super().reset(**given)
@@ -306,17 +271,13 @@ def fixed(value: Any) -> property:
     ("env", "message"),
     [
         (answering(gravity=fixed(9.8)), "gravity of Odd is 9.8, not "),
-        (answering(ground=fixed("flat")), "ground of Odd is flat, not 'stairs'"),
-        (Copies(answering(gravity=9.8)), "gravity of Copies is 9.8, not .*, after a reset"),
         (PutsBack(answering(gravity=9.8)), "gravity of PutsBack is 9.8, not .*, after a reset"),
-        (answering(gravity=property(lambda self: 9.8)), "gravity of Odd cannot be set to"),
     ],
 )
 def test_an_attribute_that_does_not_get_there_is_found(env: Any, message: str) -> None:
-    name, values = ("ground", ["stairs"]) if "ground" in message else ("gravity", (5.0, 9.0))
-    teacher = prl.Teacher("domain_randomization", prl.Parameters({name: values}))
-    with pytest.raises(ArgumentError, match=f"set.{name}='{name}': {message}"):
-        prl.TaughtEnv(env, teacher, {name: name}).reset()
+    teacher = prl.Teacher("domain_randomization", prl.Parameters({"gravity": (5.0, 9.0)}))
+    with pytest.raises(ArgumentError, match=f"set.gravity='gravity': {message}"):
+        prl.TaughtEnv(env, teacher, {"gravity": "gravity"}).reset()
 
 
 @pytest.mark.parametrize("once", [True, False])

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import json
 import random
 import re
+import sys
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from threading import Barrier, local
@@ -19,13 +20,14 @@ import numpy as np
 import pytest
 import torch
 from torch import distributed, multiprocessing
-from torch.utils.data import BatchSampler, DataLoader
+from torch.utils.data import BatchSampler
 
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching import sampler as module
 from tests.host_reads import CountedReads
-from tests.teaching.counting import ITEMS, Counting
+from tests.teaching.conftest import Install
+from tests.teaching.counting import ITEMS, Counting, through_torch
 
 REPEAT = 3
 
@@ -38,21 +40,8 @@ def parts(items: Any, size: int) -> Iterator[Any]:
 
 def sampled(length: int = 8) -> tuple[Counting, prl.Teacher, prl.TeacherSampler]:
     curriculum = Counting("success")
-    curriculum.load_state_dict = lambda state: None  # type: ignore[method-assign]
     teacher = prl.Teacher(curriculum, ITEMS, block=2)
     return curriculum, teacher, prl.TeacherSampler(teacher, length, repeat=REPEAT)
-
-
-def test_a_loader_draws_groups_and_each_gets_its_mean() -> None:
-    """Return and success of each item by hand; the groups come back in another order."""
-    curriculum, teacher, sampler = sampled()
-    loader = DataLoader(range(1000), batch_size=2 * REPEAT, sampler=sampler)  # type: ignore[arg-type]
-    drawn = [batch.flip(0) for batch in loader]
-    assert torch.cat(drawn).unique().tolist() == [*range(8)]
-    for items in reversed(drawn):
-        sampler.tell(items, torch.tensor([0.0, 1.0, 1.0] * 2), items * torch.tensor([1, 2, 3] * 2))
-    teacher.propose(1)
-    assert curriculum.seen == {n: (2.0 * n, pytest.approx(2 / 3)) for n in range(8)}
 
 
 def test_answers_come_back_in_any_order_in_parts_or_never() -> None:
@@ -88,12 +77,6 @@ REFUSED: dict[str, tuple[Any, Any, str]] = {
         r"success: has shape \[5\], but must have \[6\]",
     ),
     "no share": ([0, 0, 0, 1, 1, 1], [1.0] * 3 + [9.0] * 3, "success=9.0: must be from 0 to 1"),
-    "a mean of no shares": ([0, 0, 0], [2.0, -1.0, 0.5], "success=2.0: must be from 0 to 1"),
-    "shares by their mean": ([0, 0, 0], [-1.0, 1.0, 1.0], "success=-1.0: must be from 0 to 1"),
-    "part of a group": ([0, 1], [0.0, 2.0], "success=2.0: must be from 0 to 1"),
-    "no number": ([0, 0, 0], [1.0, 1.0, torch.nan], "success=nan: must be from 0 to 1"),
-    "no numbers": ([0, 0, 0], torch.ones(3, 1), r"success: has shape \[3, 1\]"),
-    "texts": ([0, 0, 0], ["yes"] * 3, "success=.*: must be numbers"),
     "masked": ([0, 0, 0], np.ma.array([1.0] * 3, mask=[0, 0, 1]), "success=nan: must be from 0"),
     "half an item": ([0.5, 0, 0], [1.0] * 3, r"items=\[0.5, 0, 0\]: must be whole numbers"),
 }
@@ -111,13 +94,6 @@ def test_what_is_refused_counts_nothing(what: str) -> None:
     sampler.tell([0, 0, 0, 1, 1, 1, 2, 2, 2], [1.0] * 9)
     teacher.propose(1)
     assert curriculum.seen == dict.fromkeys(range(3), (1.0, 1.0))
-
-
-def through_torch(state: Any) -> Any:
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
 
 
 def through_json(state: Any) -> Any:
@@ -199,11 +175,20 @@ def test_an_epoch_goes_on_from_every_place() -> None:
         replayed(rounds=1)[1].load_state_dict(state)
 
 
+LOADERS = (
+    "torchdata==0.11.0 accelerate==1.15.0 huggingface-hub==2.4.0 safetensors==0.8.0 psutil==7.2.2 "
+    "hf-xet==1.8.0 httpx2==2.16.2 httpcore2==2.16.2 truststore==0.10.5 typer==0.29.2 "
+    "shellingham==1.5.4"
+)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # torchdata's own
 @pytest.mark.parametrize("stateful", [True, False])
-def test_loaders_that_go_on_find_the_place(stateful: bool) -> None:
+def test_loaders_that_go_on_find_the_place(stateful: bool, install: Install) -> None:
     """torchdata's by the sampler's state; accelerate's skips what it has had."""
-    package = "torchdata.stateful_dataloader" if stateful else "accelerate"
-    made = pytest.importorskip(package)
+    sys.path.append(str(install(LOADERS)))  # last: what is there already stays
+    made: Any = import_module("torchdata.stateful_dataloader" if stateful else "accelerate")
 
     def batches(sampler: prl.TeacherSampler) -> Any:
         if stateful:
@@ -234,28 +219,6 @@ def test_loaders_that_go_on_find_the_place(stateful: bool) -> None:
             sampler.rewind()
             loader = made.skip_first_batches(loader, steps)
         assert [*begun, *train(sampler, loader, steps)] == whole
-
-
-@pytest.mark.slow
-def test_loaders_with_workers_go_on_validly() -> None:
-    """An item of an epoch is told once, and its length is kept, though batches are drawn ahead."""
-    stateful = pytest.importorskip("torchdata.stateful_dataloader").StatefulDataLoader
-
-    def train(loader: Any, sampler: prl.TeacherSampler) -> Iterator[list[int]]:
-        for batch in loader:
-            sampler.tell(batch, [1.0] * len(batch))
-            yield batch.tolist()
-
-    _, sampler = replayed(length=24, repeat=1, group=1, rounds=1)
-    loader = stateful(range(9), 4, sampler=sampler, num_workers=1)
-    assert len([*islice(train(loader, sampler), 3)]) == 3
-    states = through_torch([sampler._teacher.state_dict(), loader.state_dict()])
-    teacher, sampler = replayed(length=24, repeat=1, group=1, rounds=1)
-    teacher.load_state_dict(states[0])
-    loader = stateful(range(9), 4, sampler=sampler, num_workers=1)
-    loader.load_state_dict(states[1])
-    assert len([*train(loader, sampler)]) == 3
-    assert not any(sampler.state_dict()["out"].values())
 
 
 class Ranks:
@@ -426,11 +389,8 @@ def test_mixed_groups_are_drawn_until_there_are_enough() -> None:
     ("given", "line"),
     [
         (torch.ones(3), r"generate: has shape \[3\], but must have \[3, n\]"),
-        (torch.full((3, 2), 2.0), "generate=2.0: must be from 0 to 1"),
-        ([[1, torch.nan]] * 3, "generate=nan: must be from 0 to 1"),
         (np.ma.array(np.ones((3, 2)), mask=np.eye(3, 2)), "generate=nan: must be from 0 to 1"),
         ([[1]] * 3, "generate: must give groups of one size from 2, got 1"),
-        ([[1, 0], [1], [0, 1]], "generate=.*: must be numbers"),
     ],
 )
 def test_what_is_no_result_of_groups_drops_them(given: Any, line: str) -> None:

@@ -37,18 +37,6 @@ def test_wide_features_leave_room_for_pass_rates(last: float | None) -> None:
         assert column.tolist() == pytest.approx([-1 / 40] * 39 + [39 / 40])
 
 
-def test_tensors_of_any_kind_are_read_as_lists_are() -> None:
-    """With a gradient, and in types that NumPy has not."""
-    rates, sizes = torch.tensor([0.5, 0.25, 1.0]), torch.tensor([3.0, 1.0, 2.0])
-    expected = prl.Items(3, features={"size": sizes.tolist()}, pass_rates=rates.tolist())
-    for kind in (torch.Tensor.bfloat16, torch.Tensor.requires_grad_):
-        given = kind(sizes.clone())
-        for features in ({"size": given}, given.unsqueeze(1)):
-            items = prl.Items(3, features=features, pass_rates=kind(rates.clone()))
-            assert items.description == expected.description
-            assert not items.inputs(items.sample(2, torch.Generator())).requires_grad
-
-
 def test_wide_features_are_ranks_of_their_principal_components() -> None:
     table = torch.randn(50, 30, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     table = table @ torch.randn(30, 30, generator=torch.Generator().manual_seed(2)).double()
