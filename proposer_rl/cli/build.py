@@ -21,7 +21,7 @@ from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.methods import Components, ProposerError, Workers, filtered, make, modelled
 from proposer_rl.models import available_cores, check_torch_defaults, use_device
 from proposer_rl.runs.folder import RunFolder
-from proposer_rl.runs.process import Status, StopSignals, memory
+from proposer_rl.runs.process import Status, StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 
@@ -40,7 +40,6 @@ def parts(config: RunConfig, signals: StopSignals, status: Status | None = None)
     task = make_task(config)
     with key("solver.ppo"):
         learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
-    _check_memory(learner)
     with key("schedule"):
         check_headline(task, config.schedule)
     curriculum = _curriculum(config, task, signals, status)
@@ -92,21 +91,6 @@ def make_task(config: RunConfig) -> Task:
     return task
 
 
-def _check_memory(learner: PPO) -> None:
-    """Refuses a rollout that exceeds the memory, which would fill it step by step."""
-    levels = learner.agent.level_keys  # of which there is one for all steps
-    step = learner.env.fake_tensordict().exclude(*levels, *(("next", name) for name in levels))
-    taken, device = step.bytes() * learner.horizon, learner.env.device
-    there = memory()
-    if device is not None and device.type == "cuda":
-        there = torch.cuda.get_device_properties(device).total_memory
-    if taken > there:
-        raise ConfigError(
-            f"solver.ppo.horizon={learner.horizon}: a rollout takes at least {taken / 1e9:,.0f} GB "
-            f"of memory, there are {there / 1e9:,.0f}"
-        )
-
-
 def _made(maker: partial[Any], solver: SolverSettings, context: ComputeContext, device: str) -> Any:
     """Returns the task on a device; workers call it, too."""
     use_device(torch.device(device))
@@ -132,11 +116,9 @@ def _curriculum(
             raise TypeError(f"must make a Curriculum, but makes {type(curriculum).__name__}")
     learned = isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas
     if workers is not None and not learned:
-        hint = "; task.vectorization=async spreads one Solver's environments over processes"
         raise ConfigError(
             f"compute.collector={config.compute.collector}: this method trains no replicas "
             "that workers could have; leave compute.collector=single"
-            f"{hint if 'vectorization' in config.task else ''}"
         )
     if config.filter is not None:
         with key("filter"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import json
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -157,11 +156,6 @@ class RunConfig:
 
 def read_config(config: DictConfig) -> RunConfig:
     """Checks a composed configuration and returns it as settings."""
-    if isinstance(config.task, DictConfig) and "_target_" not in config.task:
-        raise ConfigError(
-            "task._target_: missing: the class that makes the task; a file of one's own has it "
-            "from another, such as by `defaults: [gymnasium, _self_]`"
-        )
     values = _resolved(config)
     for name, value in _leaves(values):
         if isinstance(value, int | float) and not abs(value) <= LARGEST:
@@ -177,14 +171,6 @@ def read_config(config: DictConfig) -> RunConfig:
         )
     if len(set(checked.seeds)) < len(checked.seeds):
         raise ConfigError(f"seeds={checked.seeds}: must be distinct")
-    until = checked.curriculum.get("until")
-    ends = [end for end in until if isinstance(end, int)] if isinstance(until, list) else []
-    if max(ends, default=0) >= checked.schedule.updates:
-        warnings.warn(
-            f"curriculum.until={until}: the last stage never begins, since the run ends after "
-            f"{checked.schedule.updates} updates",
-            stacklevel=2,
-        )
     return checked
 
 
@@ -200,7 +186,10 @@ def located(name: str, values: Mapping[str, Any]) -> tuple[Callable[..., Any], d
     """Returns what ``_target_`` names, and the other settings, some of which are made by Hydra."""
     target = values.get("_target_")
     if not isinstance(target, str):
-        raise ConfigError(f"{name}._target_: missing: the class or function that makes the {name}")
+        raise ConfigError(
+            f"{name}._target_: missing: the class or function that makes the {name}; a file of "
+            "your own has it from another, such as by `defaults: [gymnasium, _self_]`"
+        )
     try:
         made = instantiate({**values, "_partial_": True}, _convert_="all")
         inspect.signature(made.func)

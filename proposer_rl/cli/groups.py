@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import hashlib
 import os
 import re
@@ -18,7 +17,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
 from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.cli.help import GROUPS
-from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, available, file_content, override, yaml_file
+from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, available, override, yaml_file
 
 # Files that change a method or a scale, and must come after it, since later files win.
 CHANGED = ("method", "scale")
@@ -87,8 +86,6 @@ def arranged(overrides: Sequence[str]) -> list[str]:
     """
     words = [_at_home(word) for word in overrides]
     found = [_word(parsed) for parsed in OverridesParser.create().parse_overrides(words)]
-    if "filter=null" in overrides and not _filters(found):
-        found.remove(f"+filter={NOTHING['filter']}")  # which labels the run as changed
     groups = [word.partition("=")[0].lstrip("+") for word in found]
     end = max((place for place, group in enumerate(groups) if group in CHANGED), default=-1) + 1
     early = {place for place in range(end) if groups[place] in CHANGING}
@@ -100,13 +97,6 @@ def _at_home(word: str) -> str:
     key, _, value = word.partition("=")
     home = value.startswith("~") and key in ("hydra.run.dir", "hydra.sweep.dir")
     return override(key, Path(value).expanduser()) if home else word
-
-
-def _filters(overrides: Sequence[str]) -> bool:
-    """Returns whether one of the methods has a filter of its own; True if none is named here."""
-    names = [word.partition("=")[2] for word in overrides if word.startswith("+method=")]
-    known = [name for name in ",".join(names).split(",") if name in available("method")]
-    return not known or any(file_content(f"method/{name}").get("filter") for name in known)
 
 
 def _word(parsed: Override) -> str:
@@ -186,17 +176,11 @@ def check_chosen(config: DictConfig, hydra: Any) -> None:
         raise ConfigError(f"method: missing; choose one with +method=NAME, NAME one of: {known}")
     for group, name in hydra.runtime.choices.items():
         below = config.get(group)
-        if not isinstance(below, DictConfig) or group not in below:
-            continue
-        folders = (Path(source.path) for source in hydra.runtime.config_sources)
-        files = [folder / group / f"{name}.yaml" for folder in folders]
-        file = next((file for file in files if file.is_file()), files[0])
-        marked = file.is_file() and file.read_bytes().startswith(codecs.BOM_UTF8)
-        hidden = "; a byte-order mark hides it: save the file as UTF-8 without one"
-        raise ConfigError(
-            f"{group}={name}: the first line of {file} must be '# @package _global_', or its keys "
-            f"become {group}.{group} and so on{hidden if marked else ''}"
-        )
+        if isinstance(below, DictConfig) and group in below:
+            raise ConfigError(
+                f"{group}={name}: the first line of {group}/{name}.yaml must be '# @package "
+                "_global_', with no byte-order mark before it"
+            )
 
 
 def explained(error: Exception) -> str:

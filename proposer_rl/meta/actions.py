@@ -101,9 +101,6 @@ class Mixture(Actions):
             the space's coordinates, so that a number says how much more of one end of an axis there
             is. The identity (D = N) makes every mixture possible; fewer are learnt faster.
 
-    Raises:
-        ValueError: if ``directions`` is no finite matrix with a column for every bin.
-
     Example:
         Three bins along one axis, and an action that prefers its upper end:
 
@@ -118,14 +115,7 @@ class Mixture(Actions):
 
     def __init__(self, space: Space, directions: Tensor | None = None) -> None:
         super().__init__(space)
-        directions = space.coordinates.T if directions is None else directions
-        fits = directions.ndim == 2 and directions.shape[1] == self.bins and len(directions)
-        if not fits or not directions.isfinite().all():
-            raise ValueError(
-                f"directions must be a finite matrix [D, {self.bins}], "
-                f"got shape {list(directions.shape)}"
-            )
-        self.directions = directions.cpu()
+        self.directions = (space.coordinates.T if directions is None else directions).cpu()
 
     def spec(self, students: int, batch_size: int, device: torch.device) -> TensorSpec:
         """Returns an unbounded specification, float [K, D]."""

@@ -81,7 +81,7 @@ class SolverView:
     """
 
     def __init__(self, task: Task, *, validation_levels: int, probe_levels: int) -> None:
-        if validation_levels < 1 or not 0 <= probe_levels <= validation_levels:
+        if not 0 <= probe_levels <= validation_levels:
             raise ValueError(
                 f"probe_levels={probe_levels} must be at least 0 and at most validation_levels="
                 f"{validation_levels}: the Proposer is shown no more than it is rewarded for"
