@@ -79,7 +79,7 @@ def test_a_run_ends_with_its_picture(finished: Path) -> None:
     ("checkpoint", "said"),
     [
         ("null", "checkpoint=None: must name a run's folder or a checkpoint that has a Proposer"),
-        ("nowhere", "checkpoint=nowhere: there is no such file or folder"),
+        ("nowhere", "checkpoint=nowhere: cannot read nowhere: No such file or directory"),
         (".", "checkpoint=.: the folder holds no checkpoints and no proposer.pt"),
     ],
 )

@@ -159,7 +159,7 @@ def test_a_run_on_gymnasium_goes_on_in_its_folder(tmp_path: Path) -> None:
     assert list(run.metrics["updates"]) == [0, 2, 4]
     assert_same_run(run.folder, train(4, "whole", **steady).folder)
     train(1, "falling")
-    with pytest.raises(ValueError, match=r"schedule.updates=2: .* falls to zero in 1 updates"):
+    with pytest.raises(ValueError, match=r"anneal_updates=2: .* a longer run needs a new folder$"):
         train(2, "falling")
 
 
@@ -248,16 +248,10 @@ def test_what_cannot_be_imported_again_is_refused(tmp_path: Path) -> None:
         ("plrr", {}, "curriculum='plrr': must be prl.curricula.NAME(...) or one of accel, adap"),
         ("plr", {"scale": "tiny"}, "scale/tiny: unknown; choose one of"),
         ("plr", {"seed": "x"}, "seed='x': input should be a valid integer"),
-        ("plr", {"updates": 0}, "schedule.updates=0: input should be greater than or equal to 1"),
         ("plr", {"settings": {"slover": {}}}, "slover: unknown; there are: method"),
         ("plr", {"filter": {"times": 1}}, "filter.times=1"),
         ("plr", {"settings": {"seed": object()}}, "seed=<object object at"),
         ("plr", {"updates": {1}}, "schedule.updates={1}: must be a number, a text, a list or a ma"),
-        (
-            "plr",
-            {"updates": np.float64(1)},
-            "schedule.updates=1.0: input should be a valid integer",
-        ),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(
@@ -280,12 +274,9 @@ def test_bad_input_is_one_line_and_leaves_nothing(
         ),
         (prl.tasks.maze, {}, "task=<function .*: must be prl.tasks.NAME"),
         ("cartpole", {"curriculum": 3}, "curriculum=3: must be prl.curricula.NAME"),
-        ("cartpole", {"curriculum": prl.tasks.maze()}, "curriculum=Recipe.*: must be prl.curricul"),
         (prl.curricula.plr(), {}, "task=Recipe.*: must be prl.tasks.NAME"),
-        ("cartpole", {"filter": True}, "filter=True: must be a name, settings or None"),
-        ("maze", {"scale": 3}, "scale=3: must be a name or None"),
-        ("maze", {"folder": 3}, "folder=3: must be a path or None"),
-        ("maze", {"settings": ["seed"]}, "settings=.*: must be a mapping or None"),
+        ("cartpole", {"filter": True}, "filter=True: input should be an object, or a valid string"),
+        ("maze", {"settings": ["seed"]}, "settings=.*: input should be an object"),
     ],
 )
 def test_what_is_no_run_names_what_was_given(task: Any, more: dict, message: str) -> None:

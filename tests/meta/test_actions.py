@@ -90,12 +90,3 @@ def test_levels_are_drawn_apart_from_their_bins() -> None:
         own = drawn[..., 1][choices == choice]
         assert len(own) > 150
         assert own.mean() == pytest.approx(0.5, abs=0.08)
-
-
-@pytest.mark.parametrize(
-    "directions",
-    [torch.zeros(3), torch.full((1, 2), torch.inf), torch.zeros(0, 2), torch.zeros(1, 3)],
-)
-def test_refuses_directions_that_are_none(directions: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match=r"must be a finite matrix \[D, 2\], got shape"):
-        Mixture(Numbered(2), directions)

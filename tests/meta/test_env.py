@@ -309,12 +309,3 @@ def test_a_replica_that_diverges_has_its_number_among_all() -> None:
 def test_refuses_lengths_that_make_no_sense(options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         meta_env(**options)
-
-
-def test_refuses_a_single_solver(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = meta_env()
-    monkeypatch.setattr(env.solvers.agent, "copies", None)
-    with pytest.raises(ValueError, match="must be a population"):
-        SolverTrainingEnv(
-            env.solvers, view=env.view, actions=mixture(), reward=max, meta_episode_length=L
-        )
