@@ -40,7 +40,6 @@ from proposer_rl.recipes import (
 )
 from tests.commands import trained_run
 from tests.curricula.test_scores import DOTTED, shortfall
-from tests.processes import python
 from tests.same_run import assert_same_run
 from tests.tiny import EXAMPLES
 
@@ -326,18 +325,6 @@ def test_a_run_is_read_wherever_the_process_is_by_then(
     assert all(run.folder.is_absolute() and len(run.metrics) == 2 for run in runs)
     assert runs[1].summary["updates"] == 1 and runs[1].solver().copies == 1
     assert runs[1] == runs[3]
-
-
-def test_a_run_draws_nothing_from_the_callers_generators(tmp_path: Path) -> None:
-    """Nor do the modules that it imports: therefore in a process of its own."""
-    code = (
-        "import random; import proposer_rl as prl; import numpy, torch; "
-        "state = lambda: (random.getstate(), numpy.random.get_state()[1].tolist(), "
-        "torch.get_rng_state().tolist()); before = state(); "
-        f"prl.train('maze', 'plr', updates=1, folder='run', **{SMOKE}); assert state() == before"
-    )
-    ended = python(code, path=CONFIG_FOLDER.parent, folder=tmp_path)
-    assert ended.returncode == 0, ended.stderr
 
 
 def test_the_package_that_is_named_as_a_tasks_file_says_so() -> None:
