@@ -166,10 +166,6 @@ WRONG_COMMANDS = [
         ["+method=task_difficulty", *SMOKE, "+ablation=paper_literal"],
         "curriculum.reward: unknown; there are: checkpoint",
     ),
-    (
-        ["+method=perf_gain", "compute.collector=ray", "compute.workers=17"],
-        "compute.workers=17: must be at least 1 and at most 16, the replicas that they share",
-    ),
     (["+method=target", "compute.collector=ray"], "compute.collector=ray: this method trains no"),
 ]
 
@@ -279,7 +275,7 @@ def test_a_value_may_refer_to_another(train) -> None:
 def test_without_ray_its_collector_is_refused(train, capsys, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)  # as if it were not installed
     assert train("+method=perf_gain", "compute.collector=ray", "hydra.run.dir=run") == 2
-    line = f"error: compute.collector=ray: needs Ray; install it with: {install_command('ray')}"
+    line = f"error: compute.collector=ray needs ray; install with: {install_command('ray')}"
     assert capsys.readouterr().err.strip() == line
 
 

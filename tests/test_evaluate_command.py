@@ -129,7 +129,7 @@ def test_one_checkpoint_of_a_run(run: Path, tmp_path: Path, evaluate) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere"], "nowhere: there is no such file or folder"),
+        (["nowhere"], "nowhere: holds no checkpoints; give a run's folder"),
         (["."], ".: holds no checkpoints; give a run's folder or a checkpoint"),
         (["{run}/metrics.csv"], "is no run's folder: it has no config.json"),
         (

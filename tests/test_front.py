@@ -234,8 +234,6 @@ def test_a_score_of_ones_own_in_a_run_and_in_a_teacher(tmp_path: Path) -> None:
 def test_what_cannot_be_imported_again_is_refused(tmp_path: Path) -> None:
     with pytest.raises(prl.ArgumentError, match="must be importable"):
         own_recipe("method", lambda parts: None)
-    with pytest.raises(prl.ArgumentError, match="must be a class or a function"):
-        prl.curricula.own(prl.Curriculum())
     curriculum = prl.curricula.plr(score=lambda student, outcome: outcome["return"])
     with pytest.raises(prl.ArgumentError, match=r"^curriculum\.score=.*: must be importable"):
         prl.train("maze", curriculum, folder=tmp_path / "run", **SMOKE)

@@ -13,8 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import proposer_rl
 from proposer_rl.cli.config import LoggerSettings
-from proposer_rl.cli.errors import ConfigError
-from proposer_rl.cli.loggers import logger, require_logger
+from proposer_rl.cli.loggers import logger
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from tests import commands
 from tests.processes import Processes
@@ -72,14 +71,6 @@ def test_a_run_that_was_killed_and_goes_on_has_each_step_once_in_tensorboard(
     logged = scalars(tmp_path / "run", "cycles/cycle")
     cycles = read_jsonl(tmp_path / "run" / "cycles.jsonl")
     assert logged == [(row["updates"], row["cycle"]) for row in cycles]
-
-
-def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("proposer_rl.cli.loggers.find_spec", {"tensorboard": object()}.get)
-    require_logger(LoggerSettings(type="csv"))
-    require_logger(LoggerSettings(type="tensorboard"))
-    with pytest.raises(ConfigError, match=r"logger=wandb: .*install it with: .*\[wandb\]'?$"):
-        require_logger(LoggerSettings(type="wandb", mode="disabled"))
 
 
 def records(folder: Path) -> Iterator[Any]:

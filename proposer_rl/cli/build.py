@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import warnings
 from functools import partial
-from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import torch
 
 from proposer_rl.cli.config import CANNOT_BE_CALLED, RunConfig, key, located, task_maker
 from proposer_rl.cli.errors import ConfigError, one_line
-from proposer_rl.cli.loggers import require_logger
 from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, require
 from proposer_rl.experiment import Experiment, Log, check_headline
-from proposer_rl.extras import install_command
+from proposer_rl.extras import require_package
 from proposer_rl.learning import PPO, SolverSettings
-from proposer_rl.meta.replicas import shares
 from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.methods import Components, ProposerError, Workers, filtered, make, modelled
 from proposer_rl.models import available_cores, check_torch_defaults, use_device
@@ -36,7 +33,8 @@ class Made(NamedTuple):
 
 def parts(config: RunConfig, signals: StopSignals, status: Status | None = None) -> Made:
     """Makes task, Solvers and curriculum of an experiment; nothing is written yet."""
-    require_logger(config.logger)
+    if config.logger.type != "csv":
+        require_package(f"logger={config.logger.type}", config.logger.type, config.logger.type)
     task = make_task(config)
     with key("solver.ppo"):
         learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
@@ -134,15 +132,11 @@ def _workers(config: RunConfig, task: Task) -> Workers | None:
     compute, copies = config.compute, config.proposer.rollouts
     if compute.collector == "single":
         return None
-    if compute.collector == "ray" and find_spec("ray") is None:
-        raise ConfigError(
-            f"compute.collector=ray: needs Ray; install it with: {install_command('ray')}"
-        )
+    if compute.collector == "ray":
+        require_package("compute.collector=ray", "ray", "ray")
     on_gpus = task.device.type == "cuda"
     gpus = torch.cuda.device_count()
     count = compute.workers or min(copies, gpus if on_gpus else available_cores())
-    with key("compute"):
-        shares(copies, count)
     devices = compute.worker_devices or [task.device.type]
     if compute.collector == "multiprocess":  # Ray shows a worker only those that it reserved
         if on_gpus and compute.worker_devices is None:

@@ -162,7 +162,7 @@ def read_config(config: DictConfig) -> RunConfig:
             raise ConfigError(f"{name}={value!r}: must be finite and at most {LARGEST:,} in size")
     if isinstance(values["task"], dict):  # before what is made of its values elsewhere
         task_maker(values["task"])
-    checked = _checked(values)
+    checked = _settings(values)
     read = (value for _, value in _leaves(checked.curriculum))
     if checked.checkpoint is not None and checked.checkpoint not in read:
         raise ConfigError(
@@ -211,7 +211,7 @@ def checked_config(values: Mapping[str, Any], file: Path) -> RunConfig:
     """Returns settings as a run stored them; where it is computed is left to choice."""
     free = {"compute": {"threads": 1, "progress": False}, "logger": {"type": "csv"}}
     try:
-        return _checked({**values, **free})
+        return _settings({**values, **free})
     except (ValueError, TypeError, AttributeError, KeyError) as error:
         raise ConfigError(
             f"{file}: does not hold the settings of a run of this version: {error}"
@@ -236,11 +236,8 @@ def _resolved(config: DictConfig) -> Any:
         raise ConfigError(f"{error.full_key}: {reason}") from error
 
 
-def _checked(values: Mapping[str, Any]) -> RunConfig:
-    try:
-        return RunConfig(**arguments(RunConfig, values))
-    except ArgumentError as error:
-        raise ConfigError(str(error)) from error
+def _settings(values: Mapping[str, Any]) -> RunConfig:
+    return RunConfig(**arguments(RunConfig, values))
 
 
 def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:

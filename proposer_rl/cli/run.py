@@ -27,7 +27,7 @@ from proposer_rl.cli.loggers import logger
 from proposer_rl.experiment import Experiment
 from proposer_rl.meta.workers import WorkersError
 from proposer_rl.recipes import CONFIG_FOLDER, override_value
-from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
+from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files
 from proposer_rl.runs.folder import PROPOSER, RunFolder, storage, write_atomically
 from proposer_rl.runs.process import Interrupted, Status, StopSignals, locked, processor
 from proposer_rl.runs.records import TaskFacts, checked, small_json
@@ -137,19 +137,13 @@ def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
     One that goes on to a longer schedule has none until it ends again.
     """
     file, checkpoints = folder / SUMMARY, folder / "checkpoints"
-    wrong = f"schedule.updates={updates}: the run in {folder}"
     summary: dict[str, Any] | None = small_json(file)
-    if summary is None:
-        latest = load_latest(checkpoints)
-        made = 0 if latest is None else latest[1]["updates"]
-        if made > updates:
-            raise ConfigError(f"{wrong} has made {made} updates already")
-        return None
-    if summary["updates"] >= updates:
+    if summary is None or summary["updates"] >= updates:
         return summary
     if not checkpoint_files(checkpoints):
         raise ConfigError(
-            f"{wrong} ended after {summary['updates']} updates and has no checkpoint to go on from"
+            f"schedule.updates={updates}: the run in {folder} ended after {summary['updates']} "
+            "updates and has no checkpoint to go on from"
         )
     with storage(file):
         file.unlink()

@@ -74,18 +74,10 @@ class SolverView:
     Args:
         task: gives the target distribution, and evaluates Solvers on its levels.
         validation_levels: number E of levels that performance is measured on.
-        probe_levels: number C of levels whose answers are shown; at most E.
-
-    Raises:
-        ValueError: if a size is out of range.
+        probe_levels: number C of levels whose answers are shown.
     """
 
     def __init__(self, task: Task, *, validation_levels: int, probe_levels: int) -> None:
-        if not 0 <= probe_levels <= validation_levels:
-            raise ValueError(
-                f"probe_levels={probe_levels} must be at least 0 and at most validation_levels="
-                f"{validation_levels}: the Proposer is shown no more than it is rewarded for"
-            )
         self.task = task
         self.validation_levels = validation_levels
         self.probe_levels = probe_levels

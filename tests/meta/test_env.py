@@ -302,8 +302,6 @@ def test_a_replica_that_diverges_has_its_number_among_all() -> None:
         ({"meta_episode_length": 0}, "action_repeat=1 must divide meta_episode_length=0"),
         ({"action_repeat": 2}, f"action_repeat=2 must divide meta_episode_length={L}"),
         ({"action_repeat": 0}, f"action_repeat=0 must divide meta_episode_length={L}"),
-        ({"probe_levels": -1}, f"probe_levels=-1 must be at least 0 and .* validation_levels={E}"),
-        ({"probe_levels": 7}, f"probe_levels=7 .* and at most validation_levels={E}: the Proposer"),
     ],
 )
 def test_refuses_lengths_that_make_no_sense(options: dict, message: str) -> None:
