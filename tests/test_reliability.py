@@ -83,8 +83,6 @@ LOST = {  # how the output is lost, a signal, the exit code
     "terminal of a disowned run": ({"terminal": True, "ignored": [SIGHUP]}, None, 0),
     "pipe": ({}, None, 0),
     "pipe, Ctrl-C": ({}, SIGINT, 128 + SIGINT),
-    "pipe, SIGTERM": ({}, SIGTERM, 128 + SIGTERM),
-    "pipe, SIGUSR1": ({}, SIGUSR1, 128 + SIGUSR1),
 }
 
 
