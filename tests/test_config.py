@@ -193,7 +193,11 @@ def test_files_of_ones_own_are_found_below_config_dir(options: list[str], train,
 ALONE = ["+method=target"]
 GROUPS_AS_GIVEN = [
     ([*ALONE, "logger=null"], [*ALONE, "logger=csv"]),
-    ([*ALONE, "filter=null"], [*ALONE, "+filter=none"]),
+    ([*ALONE, "filter=null"], ALONE),
+    (
+        ["+method=plr,first_order_gain", "filter=null"],
+        ["+method=plr,first_order_gain", "+filter=none"],
+    ),
     ([*ALONE, "+filter=learnability,null"], [*ALONE, "+filter=learnability,none"]),
     ([*ALONE, "+ablation=null,x"], [*ALONE, "+ablation=none,x"]),
     (["+as=dcd", "seed=1", "+method=plr"], ["seed=1", "+method=plr", "+as=dcd"]),

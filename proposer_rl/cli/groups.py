@@ -17,7 +17,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
 from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.cli.help import GROUPS
-from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, available, override, yaml_file
+from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, available, file_content, override, yaml_file
 
 # Files that change a method or a scale, and must come after it, since later files win.
 CHANGED = ("method", "scale")
@@ -86,6 +86,8 @@ def arranged(overrides: Sequence[str]) -> list[str]:
     """
     words = [_at_home(word) for word in overrides]
     found = [_word(parsed) for parsed in OverridesParser.create().parse_overrides(words)]
+    if "filter=null" in overrides and not _filters(found):
+        found.remove(f"+filter={NOTHING['filter']}")  # which labels the run as changed
     groups = [word.partition("=")[0].lstrip("+") for word in found]
     end = max((place for place, group in enumerate(groups) if group in CHANGED), default=-1) + 1
     early = {place for place in range(end) if groups[place] in CHANGING}
@@ -97,6 +99,13 @@ def _at_home(word: str) -> str:
     key, _, value = word.partition("=")
     home = value.startswith("~") and key in ("hydra.run.dir", "hydra.sweep.dir")
     return override(key, Path(value).expanduser()) if home else word
+
+
+def _filters(overrides: Sequence[str]) -> bool:
+    """Returns whether one of the methods has a filter of its own; True if none is named here."""
+    names = [word.partition("=")[2] for word in overrides if word.startswith("+method=")]
+    known = [name for name in ",".join(names).split(",") if name in available("method")]
+    return not known or any(file_content(f"method/{name}").get("filter") for name in known)
 
 
 def _word(parsed: Override) -> str:
