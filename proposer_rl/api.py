@@ -40,7 +40,7 @@ from proposer_rl.models import (
     UNet,
 )
 from proposer_rl.recipes import DEFAULT_METHOD, Recipe, as_recipe, filter_content, override
-from proposer_rl.settings import ArgumentError, shown
+from proposer_rl.settings import ArgumentError, arguments
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.mazes import Level, LevelSpec, MazeEnv, generate_levels, shortest_path_length
@@ -240,15 +240,9 @@ def train(
     from proposer_rl.cli.compose import compose_and_run
 
     random.setstate(state)  # rich, which shows a run, draws from it as it is imported
-    given: dict[str, tuple[Any, Any, str]] = {
-        "scale": (scale, str, "a name"),
-        "filter": (filter, str | Mapping, "a name, settings"),
-        "folder": (folder, str | PathLike, "a path"),
-        "settings": (settings, Mapping, "a mapping"),
-    }
-    for name, (value, kind, allowed) in given.items():
-        if not (value is None or isinstance(value, kind)):
-            raise ArgumentError(f"{name}={shown(value)}: must be {allowed} or None")
+    arguments(
+        train, {"scale": scale, "filter": filter, "folder": folder, "settings": settings}, ["task"]
+    )
     task = as_recipe("task", "task", task)
     curriculum = as_recipe("curriculum", "method", curriculum)
     overrides = [*task.overrides(), *curriculum.overrides()]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -20,6 +21,24 @@ def install_command(extra: str) -> str:
     if constraints.is_file():
         what = ["-c", str(constraints), "-e", f"{ROOT}[{extra}]"]
     return shlex.join([sys.executable, "-m", "pip", "install", *what])
+
+
+class MissingPackageError(ImportError):
+    """A package of an extra is not installed; the message is one line that says how to get it."""
+
+    exit_code = 2
+
+
+def require_package(what: str, extra: str, *modules: str) -> None:
+    """Checks that what needs an extra has it, before anything is done.
+
+    Raises:
+        MissingPackageError: if a module is not installed.
+    """
+    missing = [name for name in modules if find_spec(name) is None]
+    if missing:
+        how = install_command(extra)
+        raise MissingPackageError(f"{what} needs {' and '.join(missing)}; install with: {how}")
 
 
 def where_to_look(error: BaseException) -> str:

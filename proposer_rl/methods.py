@@ -302,12 +302,9 @@ def proposer(
 
     Raises:
         ArgumentError: if the checkpoint holds no such Proposer, or cannot be read.
-        TypeError: if the reward is no function.
         ProposerError: for settings of the Proposer that do not go together.
         ValueError: for several seeds.
     """
-    if not callable(reward):
-        raise TypeError(f"reward must be a function of a training step, got {reward!r}")
     _one_solver(components)
     task, config = components.task, components.proposer
     if config.advantage == "leave_one_out" and config.rollouts < 2:
@@ -459,7 +456,7 @@ def _agent(components: Components, config: ProposerSettings, checkpoint: str | N
         learnt = _with_proposer(learnt_curriculum(Path(checkpoint)))
         observed = [name for name in learnt["observed"] if name != "probes"]
         load_agent(agent, TensorDict(learnt["proposer"]))
-    except CheckpointError as error:
+    except (CheckpointError, OSError) as error:
         raise ArgumentError(f"checkpoint={checkpoint}: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ArgumentError(

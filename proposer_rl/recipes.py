@@ -95,8 +95,6 @@ def own_recipe(
     Raises:
         ArgumentError: if it cannot be imported by its name.
     """
-    if not (inspect.isclass(make) or isfunction(make)):
-        raise _refusal(f"make={make!r:.60}: must be a class or a function")
     return Recipe(group, make.__name__, settings, _dotted("make", make))
 
 

@@ -55,6 +55,8 @@ class ArgumentError(ValueError):
     was given as one argument puts that argument's name and a dot before the line.
     """
 
+    exit_code = 2
+
 
 def checked(function: Callable[P, T]) -> Callable[P, T]:
     """Holds every call of a function to its signature; of a class, decorate ``__init__``.

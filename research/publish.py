@@ -10,6 +10,7 @@ import argparse
 import json
 import lzma
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -28,7 +29,7 @@ from proposer_rl.report.runs import NAMES, STUDY, Run, tables, to_csv
 from proposer_rl.report.studies import read_studies
 from proposer_rl.report.style import Drawing, in_few_colours, render
 from proposer_rl.runs.folder import write_atomically
-from proposer_rl.runs.records import anywhere, encoded, from_here, printable
+from proposer_rl.runs.records import anywhere, encoded, printable
 
 MARK = "<!-- All below is written by bin/research publish. -->"
 DATA = (
@@ -122,7 +123,7 @@ def write_page(folder: Path) -> None:
             write_atomically(folder / f"{prefix}{drawing.name}.png", _picture(drawing))
         parts.append(section(study, prefix))
         parts += [f"![{each.title}]({prefix}{each.name}.png)" for each in drawings[1:]]
-    command = anywhere(from_here(report_command("bin/report", [folder], None, ())))
+    command = anywhere(_from_here(report_command("bin/report", [folder], None, ())))
     said = above.strip() or f"{title}\n\n{DATA}"
     write_atomically(file, encoded(document([said, MARK, *parts], command, [])))
 
@@ -184,7 +185,7 @@ def _anywhere(value: Mapping[str, Any], reused: str) -> dict[str, Any]:
 
     Seeds of Proposers are called by the folders above those of their last Solvers.
     """
-    text = from_here(json.dumps(dict(value)))
+    text = _from_here(json.dumps(dict(value)))
     if os.path.isabs(reused):
         text = text.replace(json.dumps(reused)[1:-1], "/".join(Path(reused).parts[1:][-2:]))
     found: dict[str, Any] = json.loads(anywhere(text))
@@ -196,6 +197,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("folder", nargs="+", type=Path, help="of runs or studies")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the study's folder")
     return parser
+
+
+def _from_here(text: str) -> str:
+    """Text with paths inside the working folder made relative to it."""
+    return re.sub(rf"(?<![\w./]){re.escape(str(Path.cwd()))}/", "", text)
 
 
 if __name__ == "__main__":

@@ -142,18 +142,12 @@ def _trained(name: str, *arguments: str) -> list[str]:
     return ["train", *arguments, f"hydra.run.dir={RUN}/{name}"]
 
 
-def commands(extra: str, methods: list[str]) -> Iterator[list[str]]:
-    """What is called in the environment with an extra.
-
-    Args:
-        extra: its name; empty for none, where everything is called that needs none.
-        methods: all that there are.
-    """
+def commands(extra: str) -> Iterator[list[str]]:
+    """What is called in the environment with an extra; with the empty one what needs none."""
     if extra == "":
-        others = {"alp_gmm", "frozen_proposer", "adarft", "sec"}  # the last two: of items alone
-        for method in methods:
-            if method not in others:
-                yield _trained(method, f"+method={method}", *FEW)
+        # One of each kind; tests/test_needs.py runs every method.
+        for method in ("target", "accel", "perf_gain", "currot", "adaptive_mixture", "paired"):
+            yield _trained(method, f"+method={method}", *FEW)
         # Runs go on; a Proposer that has learnt is taken over.
         for method in ("accel", "perf_gain"):
             yield _trained(method, f"+method={method}", *FEW, *LONGER)
@@ -215,12 +209,11 @@ def _undrawn(folder: Path, title: str) -> Path:
 
 def _run(extra: str) -> None:
     from proposer_rl.cli import shown
-    from proposer_rl.recipes import available
 
     scripts = {script.name: script for script in metadata.entry_points(group="console_scripts")}
     if extra not in ("", "tensorboard"):  # which logs it
         shown.draw_run = _undrawn
-    for name, *arguments in commands(extra, available("method")):
+    for name, *arguments in commands(extra):
         command = scripts[f"proposer-{name}"].load()
         if name == "report":
             from proposer_rl.report import build

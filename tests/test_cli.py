@@ -79,7 +79,7 @@ def test_a_run_ends_with_its_picture(finished: Path) -> None:
     ("checkpoint", "said"),
     [
         ("null", "checkpoint=None: must name a run's folder or a checkpoint that has a Proposer"),
-        ("nowhere", "checkpoint=nowhere: there is no such file or folder"),
+        ("nowhere", "checkpoint=nowhere: cannot read nowhere: No such file or directory"),
         (".", "checkpoint=.: the folder holds no checkpoints and no proposer.pt"),
     ],
 )
@@ -177,7 +177,6 @@ def test_a_run_that_cannot_come_to_its_end_is_left_as_it_is(
         return capsys.readouterr().err
 
     (run / "summary.json").unlink()  # as if it had been interrupted just before
-    assert "schedule.updates=1: the run in" in (said := refused(1)) and "made 2 updates" in said
     assert train(*COMMAND) == 0
     with monkeypatch.context() as patched:
         patched.setattr(Experiment, "run", lambda _: os.kill(os.getpid(), signal.SIGINT))

@@ -38,31 +38,8 @@ def test_bash_completes_the_name_of_a_method(tmp_path: Path) -> None:
     assert completed == "+method=perf_gain"
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("+scale=", "+scale=medium +scale=paper +scale=quick +scale=smoke"),
-        ("+method=target solver.ppo.la", ""),
-        ("+method=target solver.ppo.lm", "solver.ppo.lmbda="),
-    ],
-)
-def test_groups_and_keys_are_completed(line, words, train, capsys, monkeypatch) -> None:
-    monkeypatch.setenv("COMP_LINE", f"proposer-train {line}")
-    assert train("-sc", "query=bash") == 0
-    assert capsys.readouterr().out.strip() == words
-
-
 @pytest.mark.usefixtures("own_folder")
 def test_a_config_folder_that_is_not_there_gets_one_line(train, capsys) -> None:
     assert train("--config-dir", "nowhere", "+method=target") == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("error: ") and "nowhere' not found" in line
-
-
-@pytest.mark.usefixtures("own_folder")
-def test_a_folder_of_ones_own_does_not_replace_the_packages_files(train, capsys) -> None:
-    own = Path("my_conf/method/target.yaml")
-    own.parent.mkdir(parents=True)
-    own.write_text("# @package _global_\nmethod: replaced\n")
-    assert train("--config-dir", "my_conf", "+method=target", "--cfg", "job") == 0
-    assert "method: target" in capsys.readouterr().out

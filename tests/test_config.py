@@ -7,7 +7,6 @@ import pickle
 import resource
 import shutil
 import sys
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -53,36 +52,26 @@ METHODS = ", ".join(sorted(file.stem for file in (CONFIG_FOLDER / "method").glob
 # Changes to the settings of +method=target, and what the line must say.
 WRONG = [
     # types
-    ("seed=many", "seed='many': input should be a valid integer"),
     ("seed='3'", "seed='3': input should be a valid integer"),
     ("seed=1.5", "seed=1.5: input should be a valid integer"),
     ("seed=true", "seed=True: input should be a valid integer"),
-    ("compute.progress=3", "compute.progress=3: input should be a valid boolean"),
-    ("task.target=[id]", "task.target=['id']: input should be a valid string"),
-    ("solver.ppo.learning_rate=fast", "learning_rate='fast': input should be a valid number"),
     ("task.network.channels=[8,x]", "task.network.channels.1='x': input should be a valid integer"),
     ("solver=8", "learning_rate: ConfigTypeError raised while"),
     ("task.distributions.id=null", "task.distributions.id=None: input should be an object"),
     # ranges
-    ("seed=-1", "seed=-1: input should be greater than or equal to 0"),
     ("seed=1e30", "seed=1e+30: must be finite and at most 1,000,000,000 in size"),
     ("solver.batch_size=0", "solver.batch_size=0: input should be greater than or equal to 1"),
-    ("solver.ppo.learning_rate=-1", "learning_rate=-1: input should be greater than 0"),
     ("solver.ppo.learning_rate=nan", "learning_rate=nan: must be finite"),
     ("solver.ppo.clip_epsilon=1", "solver.ppo.clip_epsilon=1: input should be less than 1"),
     ("task.network.channels=[]", "task.network.channels=[]: list should have at least 1 item"),
     ("schedule.threshold=1.5", "threshold=1.5: must be above 0 and at most 1, as id_success is"),
-    ("schedule.evaluate_every=0", "evaluate_every=0: input should be greater than or equal to 1"),
     ("task.distributions.id.specifications=[[0.4]]", "specifications.0.1: missing"),
     ("task.maze={height:10000,width:10000}", "task.maze.height=10000: input should be less than"),
     ("task.network={channels:[1000000],groups:1}", "the run does not fit in memory: "),
-    ("solver.ppo.horizon=1000000000", "horizon=1000000000: a rollout takes at least "),
     # one of a few
     ("precision=fp8", "precision='fp8': input should be 'auto', 'fp32' or 'bf16'"),
     ("compute.device=abacus", "compute.device='abacus': must be auto, cpu or a usable one"),
-    ("compute.device=meta", "compute.device='meta': must be auto, cpu or a usable one"),
     ("proposer.action.kind=golden", "proposer.action"),
-    ("task.distributions.id.mechanism=x", "mechanism='x': input should be 'uniform' or"),
     ("task.target=elsewhere", "task.target: must be among ['id', 'mix', 'ood'], got 'elsewhere'"),
     ("task.evaluation.distributions=[far]", "task.evaluation.distributions: must be among ['id',"),
     ("schedule.headline=fun", "headline='fun': must be one of ['id_success'"),
@@ -91,7 +80,6 @@ WRONG = [
     ("+sede=1", "sede: unknown; there are: method, scale"),
     ("+task.distributions.id.x=1", "task.distributions.id.x: unknown; there are: mechanism"),
     ("seed=${nowhere}", "seed: Interpolation key 'nowhere' not found"),
-    ("seed=???", "seed: missing"),
     ("task.target=???", "Missing mandatory value: task.target"),
     ("task.maze=${task.nowhere}", "task.maze: Interpolation key 'task.nowhere' not found"),
     # contradictions
@@ -101,7 +89,6 @@ WRONG = [
     ),
     ("solver.ppo.minibatches=129", "solver.ppo.minibatches=129: must be at most the 128"),
     ("task.maze.height=3", "task.maze: 3x10 cells are too few for this Solver"),
-    ("task.network.channels=[64,64,64,8]", "task.maze: 10x10 cells are too few"),
     ("task.maze.max_steps=5", "task.maze.max_steps=5 must be at least 12, the path length of"),
     ("task.network.channels=[12]", "must be divisible by num_groups (8)"),
     ("task.space.path_lengths=[50]", "task.space: cannot make levels with obstacle_fraction=0"),
@@ -139,24 +126,10 @@ WRONG_COMMANDS = [
         ["+method=paired", "proposer/action=problems", "proposer.action.ratio=joint"],
         "proposer.action.ratio=joint: here each draw is rewarded by itself",
     ),
-    (
-        ["method=target"],
-        "No match in the defaults list. To append to your default list use +method",
-    ),
-    (
-        ["+method=target", "task=none"],
-        "task/none: unknown; choose one of: batched, bipedal_stumps,",
-    ),
-    (["curriculum.tempo=3"], "curriculum.tempo: unknown; there are: none"),
-    (["+method=target", "+scale=tiny"], "scale/tiny: unknown; choose one of: medium, paper, quick"),
     (["+method=hand_designed", "hand_designed.until=[3, 2]"], "2 stages need 1 ascending positive"),
     (
         ["+method=hand_designed", "hand_designed.distributions=[x]"],
         "curriculum.distributions=['x']: must be some of ['id', 'mix', 'ood']",
-    ),
-    (
-        ["+method=hand_designed", "curriculum.distributions=mix"],
-        "curriculum.distributions='mix': input should be a valid array",
     ),
     (
         ["+method=hand_designed", "curriculum.until=[a]"],
@@ -164,8 +137,6 @@ WRONG_COMMANDS = [
     ),
     (["+method=target", "checkpoint=other"], "checkpoint=other: method=target takes none; those"),
     (["+method=perf_gain", "+curriculum.x=1"], "curriculum.x: unknown; there are: reward, loss"),
-    (["+method=plr", "+curriculum.x=1"], "curriculum.x: unknown; there are: score, source,"),
-    (["+method=alp_gmm", "+curriculum.x=1"], "curriculum.x: unknown; there are: source, warmup"),
     (["+method=perf_gain", "curriculum.reward=0"], "curriculum.reward=0: input should be callable"),
     (
         ["+method=target", *SMOKE, "curriculum._target_=builtins.len"],
@@ -184,16 +155,8 @@ WRONG_COMMANDS = [
         "method=target needs a student with exact_performance: GymnasiumTask tells performance by",
     ),
     (
-        ["+method=first_order_gain", *SMOKE, "curriculum.measure=luck"],
-        "curriculum.measure='luck': input should be 'log_success' or 'return'",
-    ),
-    (
         ["+method=plr", *SMOKE, "curriculum.new_levels=3"],
         "curriculum.new_levels=3: input should be an object",
-    ),
-    (
-        ["+method=first_order_proposer", *SMOKE, "curriculum.epochs=0"],
-        "curriculum.epochs=0: input should be greater than or equal to 1",
     ),
     (
         ["+method=perf_gain", *SMOKE, "proposer.action_repeat=2"],
@@ -203,15 +166,7 @@ WRONG_COMMANDS = [
         ["+method=task_difficulty", *SMOKE, "+ablation=paper_literal"],
         "curriculum.reward: unknown; there are: checkpoint",
     ),
-    (
-        ["+method=perf_gain", "compute.collector=ray", "compute.workers=17"],
-        "compute.workers=17: must be at least 1 and at most 16, the replicas that they share",
-    ),
     (["+method=target", "compute.collector=ray"], "compute.collector=ray: this method trains no"),
-    (
-        ["+method=perf_gain", "compute.collector=multiprocess", "compute.worker_devices=[abacus]"],
-        "compute.worker_devices='abacus': must be auto, cpu or a usable",
-    ),
 ]
 
 
@@ -312,24 +267,6 @@ def test_a_file_of_ones_own_that_is_no_yaml_gets_one_line(train, capsys, tmp_pat
     assert line.startswith("error: ") and f'"{file}", line 4' in line
 
 
-@pytest.mark.parametrize(
-    ("late", "early", "key"),
-    [
-        ("+method=plr", "+as=dcd", "curriculum.temperature"),
-        ("+method=sfl", "+score=sampled", "curriculum.source"),
-        ("+method=perf_gain", "+ablation=paper_literal", "curriculum.reward"),
-    ],
-)
-def test_an_order_that_is_refused_would_undo_something(late: str, early: str, key: str) -> None:
-    found = []
-    for overrides in ([late, early], [early, late], [late]):
-        GlobalHydra.instance().clear()
-        with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
-            found.append(OmegaConf.select(compose("train", overrides), key))
-    right, undone, without = found
-    assert right != without and undone == without
-
-
 def test_a_value_may_refer_to_another(train) -> None:
     arguments = ["+method=target", *SMOKE, "solver.batch_size=1"]
     arguments.append("schedule.updates=${solver.batch_size}")
@@ -342,7 +279,7 @@ def test_a_value_may_refer_to_another(train) -> None:
 def test_without_ray_its_collector_is_refused(train, capsys, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)  # as if it were not installed
     assert train("+method=perf_gain", "compute.collector=ray", "hydra.run.dir=run") == 2
-    line = f"error: compute.collector=ray: needs Ray; install it with: {install_command('ray')}"
+    line = f"error: compute.collector=ray needs ray; install with: {install_command('ray')}"
     assert capsys.readouterr().err.strip() == line
 
 
@@ -404,8 +341,7 @@ def test_a_run_of_an_earlier_version_does_not_go_on(finished: Path, train, capsy
     with pytest.raises(ConfigError, match=r"of this version: lifetimes: unknown") as read:
         saved_config(Path("run"))
     assert exit_code(read.value) == BAD_INPUT and "\n" not in str(read.value)
-    line = refused(train, capsys)
-    assert "begun by another version, which had lifetimes" in line
+    assert "lifetimes=None: the run in " in refused(train, capsys)
 
 
 def test_a_checkpoint_of_another_architecture_is_refused(finished: Path, train, capsys) -> None:
@@ -428,11 +364,8 @@ def test_a_table_that_was_shortened_is_refused(finished: Path, train, capsys) ->
     ("content", "message"),
     [
         (b"{", "is no JSON of at most 1,000,000 bytes"),
-        (b"\xff\xfe\x00", "no JSON of at most"),
-        (b'{"a": "' + b"x" * 2_000_000 + b'"}', "no JSON of at most"),
         (b"[" * 100_000, "no JSON of at most"),
         (b"[1]", "started with [1]"),
-        (b"null", "started with None"),
     ],
 )
 def test_a_stored_configuration_that_is_none_is_refused(
@@ -516,37 +449,6 @@ def smoke(method: str) -> dict[str, Any]:
     return OmegaConf.to_container(config, resolve=True)
 
 
-@pytest.mark.parametrize(
-    ("error", "said"),
-    [
-        (
-            RuntimeError("[enforce fail] can't allocate memory:\nyou tried to allocate 9 bytes"),
-            "[enforce fail] can't allocate memory: you tried to allocate 9 bytes",
-        ),
-        (
-            torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 9 GiB. GPU 0 has 8 GiB."),
-            "CUDA out of memory. Tried to allocate 9 GiB. GPU 0 has 8 GiB.",
-        ),
-        (MemoryError("9 GiB"), "9 GiB"),
-    ],
-)
-def test_a_run_that_runs_out_of_memory_says_so_in_one_line(
-    error, said, train, monkeypatch, capsys
-) -> None:
-    def measure(*_: object) -> None:
-        raise error
-
-    monkeypatch.setattr("proposer_rl.tasks.mazes.task.MazeTask.measure", measure)
-    assert train("+method=target", *SMOKE) == 2
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert told == f"error: the run does not fit in memory: {said}"
-
-
-def test_a_defect_that_speaks_of_memory_keeps_its_traceback() -> None:
-    error = RuntimeError("the buffer is allocated on another device")
-    assert exit_code(error) == UNFORESEEN
-
-
 @pytest.fixture
 def little_memory() -> Iterator[None]:
     """What asks for many GiB is told so, where the system would end the process; on Linux."""
@@ -600,11 +502,21 @@ def test_whatever_the_values_a_run_starts_or_is_refused_in_one_line(
         raise AssertionError("the signal was not heeded")
 
 
-def test_a_hand_designed_curriculum_that_never_comes_to_its_end_is_warned_of() -> None:
-    """And none of the arena's does so, whose updates are their own and stages perhaps inherited."""
-    with pytest.warns(UserWarning, match=r"^curriculum.until=\[3\]: .* ends after 3 updates$"):
-        composed("+scale=smoke", "+method=hand_designed", "schedule.updates=3")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for file in (CONFIG_FOLDER / "task" / "arena").glob("*.yaml"):
-            composed(f"task=arena/{file.stem}", "+method=hand_designed")
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (RuntimeError("can't allocate memory:\nyou tried to allocate 9 bytes"), BAD_INPUT),
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 9 GiB."), BAD_INPUT),
+        (MemoryError("9 GiB"), BAD_INPUT),
+        (RuntimeError("the buffer is allocated on another device"), UNFORESEEN),
+    ],
+)
+def test_running_out_of_memory_is_no_defect(error: Exception, code: int) -> None:
+    assert exit_code(error) == code
+    assert one_line(error).startswith("the run does not fit in memory: ") == (code == BAD_INPUT)
+
+
+def test_no_stage_of_the_arena_is_beyond_the_end_of_its_runs() -> None:
+    for file in (CONFIG_FOLDER / "task" / "arena").glob("*.yaml"):
+        config = composed(f"task=arena/{file.stem}", "+method=hand_designed")
+        assert max(config.curriculum["until"]) < config.schedule.updates

@@ -361,17 +361,6 @@ def test_rows_of_the_first_copy_are_logged(tmp_path: Path) -> None:
     assert first["id_success"] == expected["id_success"]
 
 
-def test_a_headline_that_nobody_measures_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"^headline='fun': must be one of \['id_success'"):
-        experiment(tmp_path, 0, headline="fun")
-
-
-@pytest.mark.parametrize("threshold", [0.0, 1.5])
-def test_a_rate_that_none_can_reach_is_refused(tmp_path: Path, threshold: float) -> None:
-    with pytest.raises(ValueError, match=r"threshold=.*: must be above 0 and at most 1, as id_suc"):
-        experiment(tmp_path, 0, threshold=threshold)
-
-
 @pytest.mark.parametrize("threshold", [-1e6, 1e6])
 def test_a_return_may_be_asked_to_reach_any_number(tmp_path: Path, threshold: float) -> None:
     summary = experiment(tmp_path, 0, headline="id_return", threshold=threshold).run()

@@ -15,17 +15,18 @@ from proposer_rl.extras import install_command
 from tests.test_packaging import PROJECT, ROOT
 
 EXTRAS = PROJECT["optional-dependencies"]
-CALL = re.compile(r"install_command\(([^)]*)\)")
+CALL = re.compile(r"install_command\(([^)]*)\)|require_package\(\s*[^,()]+, ([^,)]+)")
 OFFLINE = ["--dry-run", "--no-index", "--no-deps", "--no-build-isolation"]
 
 
 def test_only_extras_that_there_are_are_asked_for() -> None:
     sources = [path.read_text(encoding="utf-8") for path in (ROOT / "proposer_rl").rglob("*.py")]
-    asked = {name for source in sources for name in CALL.findall(source)}
+    asked = {"".join(names) for source in sources for names in CALL.findall(source)}
     named = {name.strip("\"'") for name in asked if name[0] in "\"'"}
     assert named == {"alp-gmm", "play", "ray"}
-    # The others are the definition, the logger's, whose extra has its name, and a setting of tasks.
-    assert asked - {f"'{name}'" for name in named} == {"extra: str", "settings.type", "extra"}
+    # The others are definitions, the logger's, whose extra has its name, and a setting of tasks.
+    others = {name for name in asked if name[0] not in "\"'"}
+    assert others == {"extra: str", "config.logger.type", "extra"}
     assert named | {"tensorboard", "wandb"} <= EXTRAS.keys()
 
 

@@ -40,7 +40,6 @@ from proposer_rl.recipes import (
 )
 from tests.commands import trained_run
 from tests.curricula.test_scores import DOTTED, shortfall
-from tests.processes import python
 from tests.same_run import assert_same_run
 from tests.tiny import EXAMPLES
 
@@ -159,7 +158,7 @@ def test_a_run_on_gymnasium_goes_on_in_its_folder(tmp_path: Path) -> None:
     assert list(run.metrics["updates"]) == [0, 2, 4]
     assert_same_run(run.folder, train(4, "whole", **steady).folder)
     train(1, "falling")
-    with pytest.raises(ValueError, match=r"schedule.updates=2: .* falls to zero in 1 updates"):
+    with pytest.raises(ValueError, match=r"anneal_updates=2: .* a longer run needs a new folder$"):
         train(2, "falling")
 
 
@@ -235,8 +234,6 @@ def test_a_score_of_ones_own_in_a_run_and_in_a_teacher(tmp_path: Path) -> None:
 def test_what_cannot_be_imported_again_is_refused(tmp_path: Path) -> None:
     with pytest.raises(prl.ArgumentError, match="must be importable"):
         own_recipe("method", lambda parts: None)
-    with pytest.raises(prl.ArgumentError, match="must be a class or a function"):
-        prl.curricula.own(prl.Curriculum())
     curriculum = prl.curricula.plr(score=lambda student, outcome: outcome["return"])
     with pytest.raises(prl.ArgumentError, match=r"^curriculum\.score=.*: must be importable"):
         prl.train("maze", curriculum, folder=tmp_path / "run", **SMOKE)
@@ -248,16 +245,10 @@ def test_what_cannot_be_imported_again_is_refused(tmp_path: Path) -> None:
         ("plrr", {}, "curriculum='plrr': must be prl.curricula.NAME(...) or one of accel, adap"),
         ("plr", {"scale": "tiny"}, "scale/tiny: unknown; choose one of"),
         ("plr", {"seed": "x"}, "seed='x': input should be a valid integer"),
-        ("plr", {"updates": 0}, "schedule.updates=0: input should be greater than or equal to 1"),
         ("plr", {"settings": {"slover": {}}}, "slover: unknown; there are: method"),
         ("plr", {"filter": {"times": 1}}, "filter.times=1"),
         ("plr", {"settings": {"seed": object()}}, "seed=<object object at"),
         ("plr", {"updates": {1}}, "schedule.updates={1}: must be a number, a text, a list or a ma"),
-        (
-            "plr",
-            {"updates": np.float64(1)},
-            "schedule.updates=1.0: input should be a valid integer",
-        ),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(
@@ -280,12 +271,9 @@ def test_bad_input_is_one_line_and_leaves_nothing(
         ),
         (prl.tasks.maze, {}, "task=<function .*: must be prl.tasks.NAME"),
         ("cartpole", {"curriculum": 3}, "curriculum=3: must be prl.curricula.NAME"),
-        ("cartpole", {"curriculum": prl.tasks.maze()}, "curriculum=Recipe.*: must be prl.curricul"),
         (prl.curricula.plr(), {}, "task=Recipe.*: must be prl.tasks.NAME"),
-        ("cartpole", {"filter": True}, "filter=True: must be a name, settings or None"),
-        ("maze", {"scale": 3}, "scale=3: must be a name or None"),
-        ("maze", {"folder": 3}, "folder=3: must be a path or None"),
-        ("maze", {"settings": ["seed"]}, "settings=.*: must be a mapping or None"),
+        ("cartpole", {"filter": True}, "filter=True: input should be an object, or a valid string"),
+        ("maze", {"settings": ["seed"]}, "settings=.*: input should be an object"),
     ],
 )
 def test_what_is_no_run_names_what_was_given(task: Any, more: dict, message: str) -> None:
@@ -335,18 +323,6 @@ def test_a_run_is_read_wherever_the_process_is_by_then(
     assert all(run.folder.is_absolute() and len(run.metrics) == 2 for run in runs)
     assert runs[1].summary["updates"] == 1 and runs[1].solver().copies == 1
     assert runs[1] == runs[3]
-
-
-def test_a_run_draws_nothing_from_the_callers_generators(tmp_path: Path) -> None:
-    """Nor do the modules that it imports: therefore in a process of its own."""
-    code = (
-        "import random; import proposer_rl as prl; import numpy, torch; "
-        "state = lambda: (random.getstate(), numpy.random.get_state()[1].tolist(), "
-        "torch.get_rng_state().tolist()); before = state(); "
-        f"prl.train('maze', 'plr', updates=1, folder='run', **{SMOKE}); assert state() == before"
-    )
-    ended = python(code, path=CONFIG_FOLDER.parent, folder=tmp_path)
-    assert ended.returncode == 0, ended.stderr
 
 
 def test_the_package_that_is_named_as_a_tasks_file_says_so() -> None:

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import struct
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from signal import SIGKILL
@@ -14,8 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import proposer_rl
 from proposer_rl.cli.config import LoggerSettings
-from proposer_rl.cli.errors import ConfigError
-from proposer_rl.cli.loggers import logger, require_logger
+from proposer_rl.cli.loggers import logger
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from tests import commands
 from tests.processes import Processes
@@ -52,12 +50,11 @@ def test_rows_and_settings_go_to_tensorboard(tmp_path: Path) -> None:
     assert event.tensor_proto.string_val == [b"{'ppo': {'gamma': 0.9}}"]
 
 
-@pytest.mark.parametrize("method", ["target", "plr"])
 def test_a_run_that_was_killed_and_goes_on_has_each_step_once_in_tensorboard(
-    method: str, processes: Processes, tmp_path: Path
+    processes: Processes, tmp_path: Path
 ) -> None:
     """As lanpa/tensorboardX#185; rows after its last checkpoint are logged twice."""
-    command = [f"+method={method}", *LITTLE, "logger=tensorboard", "schedule.cycle_length=2"]
+    command = ["+method=plr", *LITTLE, "logger=tensorboard", "schedule.cycle_length=2"]
     whole = processes(*command, f"hydra.run.dir={tmp_path / 'whole'}")
     assert whole.code == 0, whole.output
     rows = [at for at, write in enumerate(whole.writes) if write == "fsync metrics.csv"]
@@ -71,63 +68,9 @@ def test_a_run_that_was_killed_and_goes_on_has_each_step_once_in_tensorboard(
         logged = scalars(tmp_path / "run", f"{table[:-4]}/{name}")
         assert [step for step, _ in logged] == [step for step, _ in kept]
         assert [value for _, value in logged] == pytest.approx([value for _, value in kept])
-    if method == "plr":
-        logged = scalars(tmp_path / "run", "cycles/cycle")
-        kept = read_jsonl(tmp_path / "run" / "cycles.jsonl")
-        assert logged == [(row["updates"], row["cycle"]) for row in kept]
-
-
-def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("proposer_rl.cli.loggers.find_spec", {"tensorboard": object()}.get)
-    require_logger(LoggerSettings(type="csv"))
-    require_logger(LoggerSettings(type="tensorboard"))
-    with pytest.raises(ConfigError, match=r"logger=wandb: .*install it with: .*\[wandb\]'?$"):
-        require_logger(LoggerSettings(type="wandb", mode="disabled"))
-
-
-class Stand(ModuleType):
-    """In the place of the package wandb, which the tests' environment does not have."""
-
-    def __init__(self) -> None:
-        super().__init__("wandb")
-        self.runs: list[dict[str, Any]] = []
-        self.ended: list[int] = []
-
-    def init(self, **options: Any) -> Stand:
-        self.runs.append(options)
-        return self
-
-    def finish(self, exit_code: int = 0) -> None:
-        self.ended.append(exit_code)
-
-
-@pytest.fixture
-def stand(monkeypatch: pytest.MonkeyPatch) -> Stand:
-    module = Stand()
-    monkeypatch.setitem(sys.modules, "wandb", module)
-    monkeypatch.setattr("proposer_rl.cli.loggers.find_spec", lambda name: name)
-    return module
-
-
-def test_what_is_given_goes_before_the_variables_of_weights_and_biases(
-    stand: Stand, tmp_path: Path, monkeypatch
-) -> None:
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    monkeypatch.setenv("WANDB_PROJECT", "theirs")
-    for given in ({}, {"mode": "disabled", "project": "ours"}):
-        settings = LoggerSettings(type="wandb", **given)
-        require_logger(settings)
-        with (
-            pytest.raises(ZeroDivisionError),
-            logger(settings, tmp_path, "run", {"method": "plr"}),
-        ):
-            _ = 1 / 0
-    first, second = stand.runs
-    assert (first["mode"], first["project"]) == (None, "theirs")
-    assert (second["mode"], second["project"]) == ("disabled", "ours")
-    assert first["id"] == second["id"] == (tmp_path / "wandb_id.txt").read_text()
-    assert first["resume"] == "allow" and first["config"] == {"method": "plr"}
-    assert stand.ended == [1, 1]
+    logged = scalars(tmp_path / "run", "cycles/cycle")
+    cycles = read_jsonl(tmp_path / "run" / "cycles.jsonl")
+    assert logged == [(row["updates"], row["cycle"]) for row in cycles]
 
 
 def records(folder: Path) -> Iterator[Any]:

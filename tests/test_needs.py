@@ -54,7 +54,6 @@ def test_every_method_says_what_it_needs() -> None:
     assert "a Proposer that has learnt" in NEEDS[REUSED]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", sorted(m for m in NEEDS.keys() - {REUSED} if not OF_ITEMS & {*NEEDS[m]})
 )

@@ -105,7 +105,7 @@ def test_everything_runs_where_only_what_it_requires_is_installed(
     said = (tmp_path / "output").read_text(encoding="utf-8")
     assert code == 0, said[-5000:]
     done = [line.split()[1:] for line in said.splitlines() if line.startswith("DID ")]
-    assert done == list(minimal.commands(extra, available("method")))
+    assert done == list(minimal.commands(extra))
 
 
 # What comes with the loop that is taught, or with a logger that the tests do without.
@@ -127,11 +127,9 @@ def test_whatever_it_imports_anywhere_is_required(built: Built) -> None:
             assert {name.partition(".")[0] for name in names} <= known, file
 
 
-def test_every_method_task_and_command_is_called() -> None:
-    called = [words for extra in NAMED for words in minimal.commands(extra, available("method"))]
+def test_every_task_and_command_is_called() -> None:
+    called = [words for extra in NAMED for words in minimal.commands(extra)]
     words = {word for command in called for word in command}
-    methods = set(available("method")) - {"adarft", "sec"}  # of items, which no task has
-    assert {f"+method={method}" for method in methods} <= words
     # Of view mazes the smallest; gymnasium and batched are what others are made of; maze is given.
     tasks = set(available("task"))
     tasks -= {"maze", "gymnasium", "batched", "view_maze", "view_maze_quick"}

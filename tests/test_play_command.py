@@ -16,6 +16,7 @@ import httpx
 import pytest
 import uvicorn
 
+from proposer_rl import extras
 from proposer_rl.cli import play
 from proposer_rl.extras import install_command
 
@@ -125,7 +126,7 @@ def test_a_port_in_use_is_told(run: Path, capsys: pytest.CaptureFixture[str]) ->
 def test_without_its_extra_it_says_how_to_get_it(
     run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(play, "find_spec", lambda name: None)
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
     line = refusal(capsys, run)
     command = install_command("play")
     assert line == f"error: bin/play needs starlette and uvicorn; install with: {command}"

@@ -83,8 +83,6 @@ LOST = {  # how the output is lost, a signal, the exit code
     "terminal of a disowned run": ({"terminal": True, "ignored": [SIGHUP]}, None, 0),
     "pipe": ({}, None, 0),
     "pipe, Ctrl-C": ({}, SIGINT, 128 + SIGINT),
-    "pipe, SIGTERM": ({}, SIGTERM, 128 + SIGTERM),
-    "pipe, SIGUSR1": ({}, SIGUSR1, 128 + SIGUSR1),
 }
 
 
@@ -128,7 +126,7 @@ def test_a_disowned_sweep_whose_terminal_closes_finishes_its_runs(
     assert_same_run(whole[0], tmp_path / "0")
 
 
-def test_ctrl_c_at_a_pipeline_with_tee_saves(whole: tuple[Path, Ended], tmp_path: Path) -> None:
+def test_ctrl_c_at_a_pipeline_with_tee_saves(tmp_path: Path) -> None:
     """A real one, whose interpreters come to their own ends: Ctrl-C goes to the whole group."""
     command = [sys.executable, "-m", "proposer_rl.cli.start", *TRAIN, "schedule.updates=100000"]
     line = f"{shlex.join(command)} hydra.run.dir=run 2>&1 | tee log; exit ${{PIPESTATUS[0]}}"
@@ -141,11 +139,6 @@ def test_ctrl_c_at_a_pipeline_with_tee_saves(whole: tuple[Path, Ended], tmp_path
     os.killpg(pipeline.pid, SIGINT)
     assert pipeline.wait() == 128 + SIGINT
     assert load_latest(tmp_path / "run" / "checkpoints") is not None
-    line = f"{shlex.join(command[:-1])} schedule.updates=1 hydra.run.dir=one | true"
-    closed = subprocess.run(
-        ["bash", "-c", f"{line}; exit ${{PIPESTATUS[0]}}"], cwd=tmp_path, env=environment
-    )
-    assert closed.returncode == 0 and (tmp_path / "one" / "summary.json").exists()
 
 
 def test_a_signal_in_the_proposers_episode_ends_it_and_it_is_played_again(
@@ -267,7 +260,7 @@ def test_numbers_that_go_wrong_end_the_run_and_the_last_good_checkpoint_stays(
     assert diverged.code == 3, diverged.output
     assert re.match(
         r"error: cycle 0, after 2 Solver updates: copy 0: (loss_[a-z]+|grad_norm)"
-        rf" of gradient step 0 is not finite .*; .* {tmp_path}/checkpoints\n$",
+        r" of gradient step 0 is not finite \(.*\)\n$",
         diverged.output,
     ), diverged.output
     assert checkpoints(tmp_path) == before

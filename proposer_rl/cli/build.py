@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import warnings
 from functools import partial
-from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import torch
 
 from proposer_rl.cli.config import CANNOT_BE_CALLED, RunConfig, key, located, task_maker
 from proposer_rl.cli.errors import ConfigError, one_line
-from proposer_rl.cli.loggers import require_logger
 from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, require
 from proposer_rl.experiment import Experiment, Log, check_headline
-from proposer_rl.extras import install_command
+from proposer_rl.extras import require_package
 from proposer_rl.learning import PPO, SolverSettings
-from proposer_rl.meta.replicas import shares
 from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.methods import Components, ProposerError, Workers, filtered, make, modelled
 from proposer_rl.models import available_cores, check_torch_defaults, use_device
 from proposer_rl.runs.folder import RunFolder
-from proposer_rl.runs.process import Status, StopSignals, memory
+from proposer_rl.runs.process import Status, StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 
@@ -36,11 +33,11 @@ class Made(NamedTuple):
 
 def parts(config: RunConfig, signals: StopSignals, status: Status | None = None) -> Made:
     """Makes task, Solvers and curriculum of an experiment; nothing is written yet."""
-    require_logger(config.logger)
+    if config.logger.type != "csv":
+        require_package(f"logger={config.logger.type}", config.logger.type, config.logger.type)
     task = make_task(config)
     with key("solver.ppo"):
         learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
-    _check_memory(learner)
     with key("schedule"):
         check_headline(task, config.schedule)
     curriculum = _curriculum(config, task, signals, status)
@@ -92,21 +89,6 @@ def make_task(config: RunConfig) -> Task:
     return task
 
 
-def _check_memory(learner: PPO) -> None:
-    """Refuses a rollout that exceeds the memory, which would fill it step by step."""
-    levels = learner.agent.level_keys  # of which there is one for all steps
-    step = learner.env.fake_tensordict().exclude(*levels, *(("next", name) for name in levels))
-    taken, device = step.bytes() * learner.horizon, learner.env.device
-    there = memory()
-    if device is not None and device.type == "cuda":
-        there = torch.cuda.get_device_properties(device).total_memory
-    if taken > there:
-        raise ConfigError(
-            f"solver.ppo.horizon={learner.horizon}: a rollout takes at least {taken / 1e9:,.0f} GB "
-            f"of memory, there are {there / 1e9:,.0f}"
-        )
-
-
 def _made(maker: partial[Any], solver: SolverSettings, context: ComputeContext, device: str) -> Any:
     """Returns the task on a device; workers call it, too."""
     use_device(torch.device(device))
@@ -132,11 +114,9 @@ def _curriculum(
             raise TypeError(f"must make a Curriculum, but makes {type(curriculum).__name__}")
     learned = isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas
     if workers is not None and not learned:
-        hint = "; task.vectorization=async spreads one Solver's environments over processes"
         raise ConfigError(
             f"compute.collector={config.compute.collector}: this method trains no replicas "
             "that workers could have; leave compute.collector=single"
-            f"{hint if 'vectorization' in config.task else ''}"
         )
     if config.filter is not None:
         with key("filter"):
@@ -152,15 +132,11 @@ def _workers(config: RunConfig, task: Task) -> Workers | None:
     compute, copies = config.compute, config.proposer.rollouts
     if compute.collector == "single":
         return None
-    if compute.collector == "ray" and find_spec("ray") is None:
-        raise ConfigError(
-            f"compute.collector=ray: needs Ray; install it with: {install_command('ray')}"
-        )
+    if compute.collector == "ray":
+        require_package("compute.collector=ray", "ray", "ray")
     on_gpus = task.device.type == "cuda"
     gpus = torch.cuda.device_count()
     count = compute.workers or min(copies, gpus if on_gpus else available_cores())
-    with key("compute"):
-        shares(copies, count)
     devices = compute.worker_devices or [task.device.type]
     if compute.collector == "multiprocess":  # Ray shows a worker only those that it reserved
         if on_gpus and compute.worker_devices is None:

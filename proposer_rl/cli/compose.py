@@ -19,11 +19,11 @@ from omegaconf import open_dict
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from proposer_rl.cli import shown
 from proposer_rl.cli.config import RunConfig, read_config
 from proposer_rl.cli.errors import ConfigError
 from proposer_rl.cli.groups import Invocation, arranged, check_groups, explained, invocation
 from proposer_rl.cli.run import carry_out
+from proposer_rl.cli.shown import show_run
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.folder import storage
 from proposer_rl.runs.process import StopSignals
@@ -49,7 +49,7 @@ def compose_and_run(overrides: Sequence[str], own: Mapping[str, Any], folder: Pa
     with COMPOSING:
         config, asked = _composed(overrides, own, folder)
     with StopSignals() as signals:
-        carry_out(config, asked, signals, shown)
+        carry_out(config, asked, signals, show_run)
     return asked.folder
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import json
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -157,18 +156,13 @@ class RunConfig:
 
 def read_config(config: DictConfig) -> RunConfig:
     """Checks a composed configuration and returns it as settings."""
-    if isinstance(config.task, DictConfig) and "_target_" not in config.task:
-        raise ConfigError(
-            "task._target_: missing: the class that makes the task; a file of one's own has it "
-            "from another, such as by `defaults: [gymnasium, _self_]`"
-        )
     values = _resolved(config)
     for name, value in _leaves(values):
         if isinstance(value, int | float) and not abs(value) <= LARGEST:
             raise ConfigError(f"{name}={value!r}: must be finite and at most {LARGEST:,} in size")
     if isinstance(values["task"], dict):  # before what is made of its values elsewhere
         task_maker(values["task"])
-    checked = _checked(values)
+    checked = _settings(values)
     read = (value for _, value in _leaves(checked.curriculum))
     if checked.checkpoint is not None and checked.checkpoint not in read:
         raise ConfigError(
@@ -177,14 +171,6 @@ def read_config(config: DictConfig) -> RunConfig:
         )
     if len(set(checked.seeds)) < len(checked.seeds):
         raise ConfigError(f"seeds={checked.seeds}: must be distinct")
-    until = checked.curriculum.get("until")
-    ends = [end for end in until if isinstance(end, int)] if isinstance(until, list) else []
-    if max(ends, default=0) >= checked.schedule.updates:
-        warnings.warn(
-            f"curriculum.until={until}: the last stage never begins, since the run ends after "
-            f"{checked.schedule.updates} updates",
-            stacklevel=2,
-        )
     return checked
 
 
@@ -200,7 +186,10 @@ def located(name: str, values: Mapping[str, Any]) -> tuple[Callable[..., Any], d
     """Returns what ``_target_`` names, and the other settings, some of which are made by Hydra."""
     target = values.get("_target_")
     if not isinstance(target, str):
-        raise ConfigError(f"{name}._target_: missing: the class or function that makes the {name}")
+        raise ConfigError(
+            f"{name}._target_: missing: the class or function that makes the {name}; a file of "
+            "your own has it from another, such as by `defaults: [gymnasium, _self_]`"
+        )
     try:
         made = instantiate({**values, "_partial_": True}, _convert_="all")
         inspect.signature(made.func)
@@ -222,7 +211,7 @@ def checked_config(values: Mapping[str, Any], file: Path) -> RunConfig:
     """Returns settings as a run stored them; where it is computed is left to choice."""
     free = {"compute": {"threads": 1, "progress": False}, "logger": {"type": "csv"}}
     try:
-        return _checked({**values, **free})
+        return _settings({**values, **free})
     except (ValueError, TypeError, AttributeError, KeyError) as error:
         raise ConfigError(
             f"{file}: does not hold the settings of a run of this version: {error}"
@@ -247,11 +236,8 @@ def _resolved(config: DictConfig) -> Any:
         raise ConfigError(f"{error.full_key}: {reason}") from error
 
 
-def _checked(values: Mapping[str, Any]) -> RunConfig:
-    try:
-        return RunConfig(**arguments(RunConfig, values))
-    except ArgumentError as error:
-        raise ConfigError(str(error)) from error
+def _settings(values: Mapping[str, Any]) -> RunConfig:
+    return RunConfig(**arguments(RunConfig, values))
 
 
 def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:

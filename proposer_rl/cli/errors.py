@@ -115,10 +115,10 @@ def number(
 
 def check_file(option: str, file: Path | None, *suffixes: str) -> None:
     """Refuses an output file of an unknown kind or in a missing folder, before any work."""
-    if file is not None and file.suffix not in suffixes:
-        raise ConfigError(f"--{option} {file}: must end in {' or '.join(suffixes)}")
-    if file is not None and not file.parent.is_dir():
-        raise ConfigError(f"--{option} {file}: there is no folder {file.parent}")
+    if file is not None and not (file.suffix in suffixes and file.parent.is_dir()):
+        raise ConfigError(
+            f"--{option} {file}: must end in {' or '.join(suffixes)}, in a folder that exists"
+        )
 
 
 def settings_file(folder: Path) -> Path:

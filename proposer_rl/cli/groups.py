@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import hashlib
 import os
 import re
@@ -186,17 +185,11 @@ def check_chosen(config: DictConfig, hydra: Any) -> None:
         raise ConfigError(f"method: missing; choose one with +method=NAME, NAME one of: {known}")
     for group, name in hydra.runtime.choices.items():
         below = config.get(group)
-        if not isinstance(below, DictConfig) or group not in below:
-            continue
-        folders = (Path(source.path) for source in hydra.runtime.config_sources)
-        files = [folder / group / f"{name}.yaml" for folder in folders]
-        file = next((file for file in files if file.is_file()), files[0])
-        marked = file.is_file() and file.read_bytes().startswith(codecs.BOM_UTF8)
-        hidden = "; a byte-order mark hides it: save the file as UTF-8 without one"
-        raise ConfigError(
-            f"{group}={name}: the first line of {file} must be '# @package _global_', or its keys "
-            f"become {group}.{group} and so on{hidden if marked else ''}"
-        )
+        if isinstance(below, DictConfig) and group in below:
+            raise ConfigError(
+                f"{group}={name}: the first line of {group}/{name}.yaml must be '# @package "
+                "_global_', with no byte-order mark before it"
+            )
 
 
 def explained(error: Exception) -> str:

@@ -6,14 +6,11 @@ import os
 import secrets
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from proposer_rl.cli.config import LoggerSettings
-from proposer_rl.cli.errors import ConfigError
 from proposer_rl.experiment import Log
-from proposer_rl.extras import install_command
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.runs.records import batch_shares, numbers
 
@@ -21,15 +18,6 @@ ID = "wandb_id.txt"
 
 Write = Callable[[Mapping[str, float], int], None]
 """Writes numbers of an update, by their names."""
-
-
-def require_logger(settings: LoggerSettings) -> None:
-    """Checks that a logger's package is installed, before anything is written."""
-    if settings.type != "csv" and find_spec(settings.type) is None:
-        raise ConfigError(
-            f"logger={settings.type}: its package is missing; install it with: "
-            f"{install_command(settings.type)}"
-        )
 
 
 @contextmanager

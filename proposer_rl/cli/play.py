@@ -8,12 +8,11 @@ import webbrowser
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from proposer_rl.cli.errors import ConfigError, command, number, settings_file
-from proposer_rl.extras import install_command
+from proposer_rl.extras import require_package
 
 if TYPE_CHECKING:
     from proposer_rl.play.session import Session
@@ -34,11 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
-    missing = [name for name in ("starlette", "uvicorn") if find_spec(name) is None]
-    if missing:
-        raise ConfigError(
-            f"bin/play needs {' and '.join(missing)}; install with: {install_command('play')}"
-        )
+    require_package("bin/play", "play", "starlette", "uvicorn")
     session = open_session(options.run)
     from proposer_rl.play.server import application, listen, server
 

@@ -6,13 +6,13 @@ import os
 import platform
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 from signal import Signals
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -25,10 +25,9 @@ from proposer_rl.cli.groups import Invocation
 from proposer_rl.cli.help import choices, needs
 from proposer_rl.cli.loggers import logger
 from proposer_rl.experiment import Experiment
-from proposer_rl.learning import DivergedError
 from proposer_rl.meta.workers import WorkersError
 from proposer_rl.recipes import CONFIG_FOLDER, override_value
-from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files, load_latest
+from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files
 from proposer_rl.runs.folder import PROPOSER, RunFolder, storage, write_atomically
 from proposer_rl.runs.process import Interrupted, Status, StopSignals, locked, processor
 from proposer_rl.runs.records import TaskFacts, checked, small_json
@@ -41,31 +40,18 @@ FREE_SCHEDULE = {"updates", "checkpoint_every", "checkpoint_seconds", "keep_chec
 FALLING = "solver.ppo.anneal_updates"
 
 
-class Shown(Protocol):
-    """The interface of :mod:`proposer_rl.cli.shown`, which draws and prints a run's results."""
-
-    def draw_run(self, folder: Path, title: str) -> Path:
-        """Draws the picture of a run that is over; returns its file."""
-
-    def announce(
-        self,
-        method: str,
-        seeds: Sequence[int],
-        result: Mapping[str, Any],
-        folder: Path,
-        picture: Path,
-    ) -> None:
-        """Prints the results."""
+Show = Callable[[Path, str, Mapping[str, Any]], None]
+"""Shows a run that is over, given its folder, name and summary; training itself draws nothing."""
 
 
-def train(config: RunConfig, asked: Invocation, signals: StopSignals, shown: Shown) -> float:
+def train(config: RunConfig, asked: Invocation, signals: StopSignals, show: Show) -> float:
     """Carries out a run for the command line; where it is stopped, says how it goes on, and exits.
 
     Returns:
         The headline measurement at the end, e.g. for a Hydra sweeper.
     """
     try:
-        return carry_out(config, asked, signals, shown)
+        return carry_out(config, asked, signals, show)
     except Interrupted as stop:
         name = Signals(stop.signum).name
         say(f"Stopped by {name}; all is saved. To go on: {to_go_on(asked)}")
@@ -79,7 +65,7 @@ def train(config: RunConfig, asked: Invocation, signals: StopSignals, shown: Sho
 
 
 @torch.inference_mode(False)  # also where it is called without gradients
-def carry_out(config: RunConfig, asked: Invocation, signals: StopSignals, shown: Shown) -> float:
+def carry_out(config: RunConfig, asked: Invocation, signals: StopSignals, show: Show) -> float:
     """Makes the parts of an experiment, and runs it in a folder that it locks meanwhile.
 
     It is called inside the context of the signals that may ask the run to stop.
@@ -99,7 +85,7 @@ def carry_out(config: RunConfig, asked: Invocation, signals: StopSignals, shown:
         raise ConfigError(one_line(error)) from error
     with locked(asked.folder):
         try:
-            result = proceed(config, made, asked, signals, status, shown)
+            result = proceed(config, made, asked, signals, status, show)
             signals.deliver()  # of a sweep the next run is not to begin
         except Interrupted as stop:
             stop.folder = asked.folder
@@ -118,7 +104,7 @@ def proceed(
     asked: Invocation,
     signals: StopSignals,
     status: Status,
-    shown: Shown,
+    show: Show,
 ) -> dict[str, Any]:
     """Begins a run, resumes it, or says that it is finished; returns its summary."""
     path = asked.folder
@@ -135,22 +121,14 @@ def proceed(
         facts = identity(experiment, config, asked)
         described = {"planned_updates": config.schedule.updates, "task": made.task.facts}
         folder.write_json("run.json", {**facts, **described})
-        try:
-            result = experiment.run()
-        except DivergedError as error:
-            kept = path / "checkpoints"
-            if not checkpoint_files(kept):
-                raise
-            raise DivergedError(
-                f"{error}; the last checkpoints before it are kept in {kept}"
-            ) from error
+        result = experiment.run()
         if learnt := made.curriculum.learnt():
             content = checkpoint_bytes(experiment.updates, {"curriculum": learnt})
             write_atomically(path / PROPOSER, content)
-        folder.write_json(SUMMARY, {**facts, **result})
-        picture = shown.draw_run(path, run_name(config))
-    shown.announce(config.method, config.seeds, result, path, picture)
-    return result
+        summary = {**facts, **result}
+        folder.write_json(SUMMARY, summary)
+    show(path, run_name(config), summary)
+    return summary
 
 
 def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
@@ -159,19 +137,13 @@ def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
     One that goes on to a longer schedule has none until it ends again.
     """
     file, checkpoints = folder / SUMMARY, folder / "checkpoints"
-    wrong = f"schedule.updates={updates}: the run in {folder}"
     summary: dict[str, Any] | None = small_json(file)
-    if summary is None:
-        latest = load_latest(checkpoints)
-        made = 0 if latest is None else latest[1].get("updates")
-        if isinstance(made, int) and made > updates:
-            raise ConfigError(f"{wrong} has made {made} updates already")
-        return None
-    if summary["updates"] >= updates:
+    if summary is None or summary["updates"] >= updates:
         return summary
     if not checkpoint_files(checkpoints):
         raise ConfigError(
-            f"{wrong} ended after {summary['updates']} updates and has no checkpoint to go on from"
+            f"schedule.updates={updates}: the run in {folder} ended after {summary['updates']} "
+            "updates and has no checkpoint to go on from"
         )
     with storage(file):
         file.unlink()
@@ -198,23 +170,13 @@ def check_same_run(folder: RunFolder, config: RunConfig) -> None:
         folder.write_json(file.name, now)
         return
     before = stored_config(file)
-    if isinstance(before, dict) and (gone := before.keys() - now.keys()):
-        raise ConfigError(
-            f"{wrong} the run there was begun by another version, which had "
-            f"{', '.join(sorted(gone))}; it can be read, but not gone on with"
-        )
     differing = _different(before, now)
     if differing:
         key, (old, new) = next(iter(differing.items()))
-        if [*differing] == [FALLING] and new == config.schedule.updates:
-            raise ConfigError(
-                f"schedule.updates={new}: the learning rate of the run in {folder.path} falls to "
-                f"zero in {old} updates ({FALLING} follows schedule.updates), so that a longer one "
-                "is another run; give it a folder of its own"
-            )
+        falls = "; by default it is schedule.updates: a longer run needs a new folder"
         raise ConfigError(
             f"{key}={new!r:.80}: the run in {folder.path} was started with {old!r:.80}; "
-            f"differing keys: {', '.join(differing)}"
+            f"differing keys: {', '.join(differing)}{falls * ([*differing] == [FALLING])}"
         )
 
 

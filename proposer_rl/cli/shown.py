@@ -5,7 +5,7 @@ Training is given this module and knows nothing of what draws; figures take a wh
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +29,13 @@ def draw_run(folder: Path, title: str) -> Path:
     return figures.draw_run(folder, title)
 
 
-def announce(
-    method: str, seeds: Sequence[int], result: Mapping[str, Any], folder: Path, picture: Path
-) -> None:
-    """Prints the results."""
+def show_run(folder: Path, name: str, result: Mapping[str, Any]) -> None:
+    """Draws the picture of a run that is over, and prints its summary."""
+    picture, seeds = draw_run(folder, name), result["seeds"]
     for seed, reached, final in zip(
         seeds, result["updates_to_threshold"], result["final"], strict=True
     ):
-        say(f"{method}, seed {seed}: {_outcome_text(result, reached, final)}")
+        say(f"{result['method']}, seed {seed}: {_outcome_text(result, reached, final)}")
     say(_cost_text(result, len(seeds)))
     say(f"Files: {folder}  (picture: {picture.name})")
 

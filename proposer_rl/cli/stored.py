@@ -73,10 +73,8 @@ def stored_run(path: Path) -> StoredRun:
     Args:
         path: the folder, or one of its checkpoints, which is the only file then.
     """
-    if not path.exists():
-        raise ConfigError(f"{path}: there is no such file or folder")
     folder, files = path.resolve(), [file for _, file in checkpoint_files(path / "checkpoints")]
-    if not path.is_dir():
+    if path.is_file():
         folder, files = folder.parent.parent, [path]
     if not files:
         raise ConfigError(f"{path}: holds no checkpoints; give a run's folder or a checkpoint")

@@ -38,18 +38,8 @@ from proposer_rl.recipes import CONFIG_FOLDER, override
 from proposer_rl.runs.folder import FAILURE, RunFolder
 from proposer_rl.runs.process import InUseError, StopSignals, guard_output
 
-LONGEST = 300  # characters of what is said of a lost job
 # The folder of the command's run or sweep, and the failures that a sweep's had before.
 COMMAND: list[tuple[Path, dict[Path, int] | None]] = []
-
-
-class LostJobError(RuntimeError):
-    """A job of another machine or process ended without a word of its run; the message is one line.
-
-    The same command goes on with what is left.
-    """
-
-    exit_code = 6
 
 
 class FailedRunError(RuntimeError):
@@ -87,12 +77,6 @@ def _compose_and_run() -> None:
         pass  # it has been told, and is in the sweep's overview
     except (HydraException, OmegaConfBaseException, UnicodeDecodeError, YAMLError) as error:
         raise ConfigError(explained(error)) from error
-    except RuntimeError as error:
-        if not type(error).__module__.startswith("submitit."):
-            raise
-        raise LostJobError(
-            f"no job was sent, or it left no result: {one_line(error)[:LONGEST]}"
-        ) from error
     except (OSError, ValueError) as error:
         # Of Hydra's own files; logging hides it in a ValueError.
         cause = error if isinstance(error, OSError) else error.__cause__
@@ -121,11 +105,11 @@ def _main(hydra_config: DictConfig) -> float:
         check_groups(asked.overrides)
         check_chosen(hydra_config, about)
         with signals:  # already now: amid imports is no place to stop
-            from proposer_rl.cli import shown  # only now: it takes seconds
-            from proposer_rl.cli.config import read_config
+            from proposer_rl.cli.config import read_config  # only now: it takes seconds
             from proposer_rl.cli.run import train
+            from proposer_rl.cli.shown import show_run
 
-            return train(read_config(hydra_config), asked, signals, shown)
+            return train(read_config(hydra_config), asked, signals, show_run)
     except Exception as error:
         if not in_sweep:
             if exit_code(error) != UNFORESEEN:

@@ -115,8 +115,7 @@ class Mixture(Actions):
 
     def __init__(self, space: Space, directions: Tensor | None = None) -> None:
         super().__init__(space)
-        directions = space.coordinates.T if directions is None else directions
-        self.directions = directions.cpu()
+        self.directions = (space.coordinates.T if directions is None else directions).cpu()
 
     def spec(self, students: int, batch_size: int, device: torch.device) -> TensorSpec:
         """Returns an unbounded specification, float [K, D]."""

@@ -55,7 +55,7 @@ class ProposerSettings:
         meta_episode_length: updates L of a meta-episode.
         action_repeat: updates for which an action holds; divides L.
         validation_levels: size E of the batch that the gain is measured on.
-        probe_levels: number C of target levels through which the Solver is seen; at most E.
+        probe_levels: number C of target levels through which the Solver is seen.
         observes: numbers that are observed beside the probes.
         action: what an action means.
         own_action: what the Solver itself trains on: a sample of the policy or its mode.

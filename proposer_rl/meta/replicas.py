@@ -24,7 +24,6 @@ from proposer_rl.meta.env import SolverTrainingEnv, action_generators
 from proposer_rl.meta.rewards import Reward
 from proposer_rl.meta.workers import WorkersError, WorkerSettings, lost, quiet, start, stop
 from proposer_rl.models import ActorCritic, uniform_noise, use_device
-from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
@@ -73,9 +72,6 @@ class ReplicasInWorkers(Replicas):
         make_env: makes a worker's environment, given its ``share`` of the replicas, ``device`` and
             number of ``threads``, such as :func:`worker_env`; can be pickled.
         settings: how many workers there are, and where.
-
-    Raises:
-        ValueError: for more workers than replicas.
     """
 
     def __init__(
@@ -263,14 +259,7 @@ def shares(replicas: int, workers: int) -> list[range]:
     Where K is no multiple of the workers, the last ranges overlap: what one process has to do
     takes no longer for it, and TorchRL's collectors want batches of one shape.
 
-    Raises:
-        ArgumentError: for more workers than replicas, or none.
     """
-    if not 1 <= workers <= replicas:
-        raise ArgumentError(
-            f"workers={workers}: must be at least 1 and at most {replicas}, the replicas that they "
-            "share"
-        )
     each = -(-replicas // workers)
     starts = [min(worker * each, replicas - each) for worker in range(workers)]
     return [range(start, start + each) for start in starts]

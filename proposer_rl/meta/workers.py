@@ -166,7 +166,6 @@ def _cluster_share(
     workers, cores, address = settings.workers, settings.cores, settings.ray_address
     cluster: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
     if address is not None:
-        _knock(address)
         cluster["address"] = address
     else:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # our own cluster reports to nobody
@@ -174,11 +173,9 @@ def _cluster_share(
         processors = max(os.cpu_count() or 1, cores * workers)
         cluster |= {"address": "local", "num_cpus": processors, "include_dashboard": False}
     try:
+        _knock(address)
         _connect(cluster, check)
-    except TimeoutError:
-        reason = f"no cluster that this machine is part of answers in {SECONDS_TO_ANSWER:.0f} s"
-        raise WorkersError(f"ray_address={address}: {reason}") from None
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         reason = str(error).partition("\n")[0]
         raise WorkersError(f"ray_address={address}: no cluster answers there: {reason}") from error
     on_gpus = any(torch.device(device).type == "cuda" for device in settings.devices)
@@ -282,15 +279,11 @@ def _connect(cluster: dict[str, Any], check: Callable[[], None]) -> None:
             return
         check()
         if time.monotonic() > until:
-            raise TimeoutError
+            raise TimeoutError(f"none that this machine is part of in {SECONDS_TO_ANSWER:.0f} s")
 
 
-def _knock(address: str) -> None:
-    """Raises a WorkersError at once if nothing answers at the address of a cluster."""
-    host, _, port = address.rpartition(":")
-    if not host or not port.isdigit():
-        return  # a name that Ray itself resolves, such as auto
-    try:
+def _knock(address: str | None) -> None:
+    """Raises an OSError at once if nothing answers at the address of a cluster."""
+    host, _, port = (address or "").rpartition(":")
+    if host and port.isdigit():  # no name that Ray itself resolves, such as auto
         socket.create_connection((host, int(port)), SECONDS_TO_CLOSE).close()
-    except (OSError, OverflowError) as error:
-        raise WorkersError(f"ray_address={address}: no cluster answers there: {error}") from error

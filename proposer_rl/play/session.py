@@ -19,7 +19,6 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import Board, Levels, PlayableTask, Task
 
 SHOWN = 12  # levels of a draw
-MOST_LEVELS = 200  # of a file
 KEPT = 4  # checkpoints in memory
 LARGEST_SIDE = 64  # cells of a drawing
 MOST_STEPS = 5000  # of an episode
@@ -224,8 +223,6 @@ class Session:
         return {"updates": sample.updates, "levels": shown}
 
     def _named(self, levels: Mapping[str, Levels]) -> dict[str, Any]:
-        if len(levels) > MOST_LEVELS:
-            raise ValueError(f"at most {MOST_LEVELS} levels of a file are shown")
         drawings = {name: self._drawing(level) for name, level in levels.items()}
         return {
             "levels": [

@@ -157,8 +157,6 @@ def learnt_curriculum(path: Path) -> State:
         CheckpointError: if there is none, or it cannot be used.
         StorageError: if it cannot be read.
     """
-    if not path.exists():
-        raise CheckpointError("there is no such file or folder")
     latest = load_latest(path / "checkpoints") if path.is_dir() else load_checkpoint(path)
     if latest is None and (path / PROPOSER).exists():
         latest = load_checkpoint(path / PROPOSER)

@@ -280,13 +280,3 @@ def processor() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
-
-
-def memory() -> int:
-    """Returns the bytes that this process may use, by the machine and its container."""
-    if not hasattr(os, "sysconf"):  # Windows
-        return sys.maxsize
-    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    with suppress(OSError, ValueError):  # "max", or no such file
-        return min(whole, int(Path("/sys/fs/cgroup/memory.max").read_text()))
-    return whole

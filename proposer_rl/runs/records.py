@@ -112,11 +112,6 @@ def encoded(text: str) -> bytes:
     return text.encode("utf-8", "replace")
 
 
-def from_here(text: str) -> str:
-    """Returns text with paths inside the working folder made relative to it."""
-    return re.sub(rf"(?<![\w./]){re.escape(str(Path.cwd()))}/", "", text)
-
-
 def anywhere(text: str) -> str:
     """Returns text with absolute paths cut to their last part, to be free of the machine."""
     return re.sub(r"(?<![\w./])/(?:[\w.\-]+/)+", "", text)

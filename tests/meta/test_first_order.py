@@ -336,7 +336,7 @@ def test_a_target_without_any_success_is_told_in_one_line() -> None:
     assert "\n" not in str(info.value)
 
 
-def test_a_measure_that_there_is_not_is_refused() -> None:
+def test_success_that_a_task_does_not_tell_is_refused() -> None:
     told = TensorDict({"return": torch.rand(1, 3)}, [1, 3])
     with pytest.raises(ValueError, match="this task tells no success, only the return"):
         target_performance(told, "log_success")

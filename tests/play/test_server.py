@@ -318,7 +318,6 @@ WRONG = [
     ("levels", {"source": "file", "text": "/etc/passwd"}, "a level is a rectangle of"),
     ("levels", {"source": "file", "text": "S#\n#G"}, "the goal cannot be reached"),
     ("levels", {"source": "file", "text": "S" + "." * 64 + "G"}, "more than 64 cells"),
-    ("levels", {"source": "file", "text": "".join(f"[{i}]\nSG\n" for i in range(999))}, "200"),
     ("file", {"name": "", "rows": ROWS}, "a name has 1 to 80"),
 ]
 

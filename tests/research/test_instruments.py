@@ -47,7 +47,7 @@ def test_signal_and_noise_of_every_checkpoint(run: Path, tmp_path: Path, capsys)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere"], "nowhere: there is no such file or folder"),
+        (["nowhere"], "nowhere: holds no checkpoints"),
         (["{run}", "--copies", "1"], "--copies: must be a whole number of at least 2, got '1'"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from signal import SIGKILL
 
@@ -57,9 +58,10 @@ def test_killed_with_its_worker_and_resumed_it_is_the_run_that_was_not(
             assert {**one, "seconds": 0} == pytest.approx({**other, "seconds": 0}, abs=1e-4)
 
 
-def test_without_the_cluster_one_line_and_exit_code_6(processes: Processes, tmp_path: Path) -> None:
+def test_without_the_cluster_one_line_and_exit_code_6(
+    train: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     ray = ["compute.collector=ray", "compute.workers=2", "compute.ray_address=127.0.0.1:1"]
-    ended = processes(*COMMAND, *ray, f"hydra.run.dir={tmp_path}")
-    assert ended.code == 6, ended.output
-    last = ended.output.strip().splitlines()[-1]
+    assert train(*COMMAND, *ray, f"hydra.run.dir={tmp_path}") == 6
+    last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith("error: compute.ray_address=127.0.0.1:1: no cluster answers there: ")
