@@ -36,7 +36,7 @@ class Again(Curriculum):
         probability: with which a failed level takes the place of a new one.
     """
 
-    remembers = ("_inbox",)  # what a resumed run needs
+    state = ("_inbox",)  # what a resumed run needs
 
     @checked
     def __init__(self, fresh: Distribution, probability: Share) -> None:

@@ -124,7 +124,7 @@ def test_the_paths_that_are_recorded_are_legal(plain: tuple[Experiment, dict, Pa
 class Costly(LearnedCurriculum):
     """Notes what it is called for, and says that all of it has a price."""
 
-    remembers: tuple[str, ...] = ("observed",)
+    state: tuple[str, ...] = ("observed",)
 
     def __init__(self) -> None:
         self.events: list[tuple] = []
@@ -280,7 +280,7 @@ def test_levels_that_a_curriculum_shows_are_recorded(tmp_path: Path) -> None:
 class Stopped(Costly):
     """A signal comes in the middle of its second improvement."""
 
-    remembers = ("observed", "begun")
+    state = ("observed", "begun")
 
     def __init__(self, signals: StopSignals | None) -> None:
         super().__init__()

@@ -101,7 +101,7 @@ def test_a_mixture_is_what_its_methods_propose_by_themselves() -> None:
         "learning_progress": {"source": "episodes", "exploration": 1.0},
     }
     made = mixture(ON_RANGES, parts)
-    assert made.needs == () and made.reads == ("success",)
+    assert made.needs == () and made.required_results == ("success",)
     drawn = made.propose(Student(), 40, [Streams(0)]).levels["x"][0]
     assert (drawn[:10] == 1).all()
     alone = SamplingCurriculum(RANGES).propose(Student(), 20, [Streams(0, "part", 1)])
@@ -111,7 +111,7 @@ def test_a_mixture_is_what_its_methods_propose_by_themselves() -> None:
 
 def test_the_mixture_of_thirds_asks_one_model_of_success_and_nobody_else() -> None:
     teacher = prl.Teacher(prl.curricula.mixture(parts={"currot": {"every": 2}}), RANGES)
-    assert teacher.curriculum.needs == () and teacher.reads == ("success",)
+    assert teacher.curriculum.needs == () and teacher.required_results == ("success",)
     for _ in range(6):
         drawn = teacher.propose(60)["x"]
         assert (drawn[20:40] == 1).all()

@@ -12,8 +12,9 @@ from collections.abc import Callable
 from typing import Any
 
 from proposer_rl.curricula.adaptive import AdaptiveMixture as AdaptiveMixture
+from proposer_rl.curricula.adr import BoundsCurriculum as BoundsCurriculum
+from proposer_rl.curricula.alp_gmm import MixtureCurriculum as MixtureCurriculum
 from proposer_rl.curricula.bins import BinCurriculum as BinCurriculum
-from proposer_rl.curricula.bounds import BoundsCurriculum as BoundsCurriculum
 from proposer_rl.curricula.buffer import ReplayRule as ReplayRule
 from proposer_rl.curricula.combinators import Filtered as Filtered
 from proposer_rl.curricula.combinators import Mixed as Mixed
@@ -23,30 +24,29 @@ from proposer_rl.curricula.contract import Curriculum as Curriculum
 from proposer_rl.curricula.contract import Inbox as Inbox
 from proposer_rl.curricula.contract import LearnedCurriculum as LearnedCurriculum
 from proposer_rl.curricula.contract import outcome_of as outcome_of
+from proposer_rl.curricula.currot import TransportCurriculum as TransportCurriculum
 from proposer_rl.curricula.first_order import FirstOrderCurriculum as FirstOrderCurriculum
-from proposer_rl.curricula.gaussians import MixtureCurriculum as MixtureCurriculum
+from proposer_rl.curricula.items import AdaptiveDifficulty as AdaptiveDifficulty
+from proposer_rl.curricula.items import ArcLengthFilter as ArcLengthFilter
+from proposer_rl.curricula.items import BetaSampling as BetaSampling
+from proposer_rl.curricula.items import CategoryBandit as CategoryBandit
 from proposer_rl.curricula.outcome_model import Modelled as Modelled
 from proposer_rl.curricula.problem_proposer import FirstOrderProposer as FirstOrderProposer
 from proposer_rl.curricula.problem_proposer import PairedProposer as PairedProposer
 from proposer_rl.curricula.problem_proposer import ProblemProposer as ProblemProposer
 from proposer_rl.curricula.progress import LearningProgressCurriculum as LearningProgressCurriculum
-from proposer_rl.curricula.prompts import AdaptiveDifficulty as AdaptiveDifficulty
-from proposer_rl.curricula.prompts import ArcLengthFilter as ArcLengthFilter
-from proposer_rl.curricula.prompts import BetaSampling as BetaSampling
-from proposer_rl.curricula.prompts import CategoryBandit as CategoryBandit
 from proposer_rl.curricula.proposer import ProposerCurriculum as ProposerCurriculum
 from proposer_rl.curricula.proposer import ProposerTrainer as ProposerTrainer
 from proposer_rl.curricula.replay import ReplayCurriculum as ReplayCurriculum
-from proposer_rl.curricula.rows import RowsCurriculum as RowsCurriculum
 from proposer_rl.curricula.sampling import SamplingCurriculum as SamplingCurriculum
 from proposer_rl.curricula.sampling import SelectionCurriculum as SelectionCurriculum
 from proposer_rl.curricula.scores import Scorer as Scorer
-from proposer_rl.curricula.self_paced import SelfPacedCurriculum as SelfPacedCurriculum
+from proposer_rl.curricula.spdl import SelfPacedCurriculum as SelfPacedCurriculum
 from proposer_rl.curricula.student import Student as Student
 from proposer_rl.curricula.student import TaskStudent as TaskStudent
 from proposer_rl.curricula.student import UnfitStudentError as UnfitStudentError
 from proposer_rl.curricula.student import require as require
-from proposer_rl.curricula.transport import TransportCurriculum as TransportCurriculum
+from proposer_rl.curricula.terrain_levels import RowsCurriculum as RowsCurriculum
 from proposer_rl.recipes import Recipe, available, own_recipe, recipe_function
 
 

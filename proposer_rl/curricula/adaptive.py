@@ -1,25 +1,25 @@
-"""A mixture of the target, uniform sampling and a way between them, by what is seen of each.
+"""A mixture of the target, uniform sampling and a bridge between them, by what is seen of each.
 
 Every batch has three arms: levels of the **target** itself; **uniform** ones of the whole space;
-and the **way**: levels that a belief holds for mastered, as near to the target as there are. With b
-the success on the target lately, their shares are
+and the **bridge**: levels that a belief holds for mastered, as near to the target as there are.
+With b the success on the target lately, their shares are
 
     t = low + (HIGH - low) b / (b + HALF),      w = (1 - t) q,      u = (1 - t) (1 - q).
 
 The target gets more the more often it is solved: there training pays most. While it is never
 solved, ``low`` lies between FLOOR, where its episodes alone all return the same and teach nothing,
-and LOW, where they differ at least half as much as all episodes do. Of what is left the way gets a
-part q that grows with the skill of the belief, the correlation of what it predicted with what came
-on uniform levels: the way needs to know which levels are easier, and a student that improves is
+and LOW, where they differ at least half as much as all episodes do. Of what is left the bridge gets
+a part q that grows with the skill of the belief, the correlation of what it predicted and what came
+on uniform levels: the bridge needs to know which levels are easier, and a student that improves is
 ahead of any forecast of how often it succeeds. Uniform sampling is never given up, as beliefs may
 be wrong; with little skill it leads. b is the largest that was seen, which fades with the half-life
 LATER, so that a target that is forgotten while others are trained on is not left alone.
 
-For the way, each of some draws of the target gets the candidate of its own that is nearest to it
+For the bridge, each of some draws of the target gets the candidate of its own that is nearest to it
 among those whose expected success is at least ``delta``, by optimal assignment with squared
 distances, less a bonus for learnability, 4 p (1 - p). Where too few are expected to succeed so
 often, the best take their place. Candidates are new levels of the space and levels between those
-of the last batch's way and the target, where the space knows what lies between two levels: the
+of the last batch's bridge and the target, where the space knows what lies between two levels: the
 interpolation of Klink et al. 2022, "Curriculum Reinforcement Learning via Constrained Optimal
 Transport" (ICML), with particles in place of bins, and no pace but what is mastered.
 
@@ -53,16 +53,18 @@ from proposer_rl.task import Distribution, Levels, Space, level_inputs
 Inputs = Callable[[Levels], Tensor]
 """What is known of levels [*B]: float [*B, D], each about -1 to 1."""
 
-ARMS = ("target", "uniform", "way")
-TARGET, UNIFORM, WAY = range(3)
+ARMS = ("target", "uniform", "bridge")
+TARGET, UNIFORM, BRIDGE = range(3)
 SUMS = (
     *("levels", "successes", "labels", "squared labels"),
     *("predicted", "squared predicted", "products"),
     *("returns", "squared returns"),
 )
 FLOOR, LOW, HIGH = 0.1, 0.25, 0.9  # of the share of the target
-HALF, HALF_OF_RETURNS = 0.1, 0.5  # b at half of the way from low to HIGH; where success is not told
-WAY_LEAST, WAY_AT_ONCE, WAY_MOST = 0.2, 0.4, 0.8  # part q: with no skill it is that in the middle
+# b at half of the distance from low to HIGH; where success is not told
+HALF, HALF_OF_RETURNS = 0.1, 0.5
+# part q: with no skill it is that in the middle
+BRIDGE_LEAST, BRIDGE_AT_ONCE, BRIDGE_MOST = 0.2, 0.4, 0.8
 SOON, LATER = 6.0, 20.0  # half-lives in batches: of sums, and of b where success falls again
 # Added to the sums of squares of predictions and labels that a correlation is of: a few say little.
 UNSURE = 0.05, 0.5
@@ -71,7 +73,7 @@ RARE = 0.02  # share of successes, below which the belief learns from returns, t
 LEARNABLE = 0.2  # of the bonus, in squared distances per input
 ITEMS_LEARNABLE, ITEMS_TIMES = 1.0, 4  # that, and times as many candidates, of a data set
 NEAR = 0.025  # standard deviation of what is added between two levels, in shares of a range
-# Levels of the way that are assigned to draws of the target together. The time of an assignment
+# Levels of the bridge that are assigned to draws of the target together. The time of an assignment
 # grows faster than with the square: of 288, it is 10 ms in blocks of 64, 30 of 128, 150 at once.
 # Of more than LARGE, blocks are half as large, which takes a third of the time.
 AT_ONCE, LARGE = 64, 512
@@ -83,7 +85,7 @@ EQUAL = 1e-9  # returns that differ no more than this are equal, in units of the
 
 
 class AdaptiveMixture(Curriculum):
-    """Mixes the target, uniform sampling and a way between them by what was seen of each.
+    """Mixes the target, uniform sampling and a bridge between them by what was seen of each.
 
     See the module for the equations. Labels are successes where they are told; else returns, as
     shares of the range from the lowest to the highest that was seen, less one in a thousand at
@@ -91,19 +93,20 @@ class AdaptiveMixture(Curriculum):
     nothing of a student, so that it costs no frames and no oracle.
 
     Args:
-        space: where levels come from. ``between(a, b, noise, generator)`` gives levels on the way,
+        space: where levels come from. ``between(a, b, noise, generator)`` gives levels between two,
             ``items(levels)`` the numbers of levels that come back one by one, ``expected`` log odds
             of success of each, float64 [N], before anything is seen.
         target: what is to be mastered; None where all levels of the space count: then there are
-            the uniform arm and the way alone, whose levels are learnable ones near to uniform ones.
+            the uniform arm and the bridge alone, whose levels are learnable ones near to uniform
+            ones.
         inputs: what the belief knows of levels; None for what the space says, see
             :func:`~proposer_rl.task.level_inputs`.
-        delta: least expected success of a level of the way.
+        delta: least expected success of a level of the bridge.
         half_life: batches after which the belief counts an outcome half.
-        times: candidates for each level of the way.
+        times: candidates for each level of the bridge.
     """
 
-    remembers = ("_inbox", "_sums", "_best", "_ends", "_number", "_told", "_seen", "_shown")
+    state = ("_inbox", "_sums", "_best", "_ends", "_number", "_told", "_seen", "_shown")
 
     @checked
     def __init__(
@@ -128,7 +131,7 @@ class AdaptiveMixture(Curriculum):
         # The lowest returns and the negatives of the highest [2, K, m], of how many levels.
         self._ends, self._number = torch.zeros(2, 0, 0, dtype=torch.float64), 0
         self._told = False  # whether success is told
-        self._last: dict[str, Levels] = {}  # on the way, of each student [m]
+        self._last: dict[str, Levels] = {}  # of the bridge, of each student [m]
         self._seen = Predictions()
         self._some: dict[str, Levels] = {}  # of the last levels, by their arms
         self._shown: dict[str, Any] = {}
@@ -172,7 +175,7 @@ class AdaptiveMixture(Curriculum):
         return shown | self._seen.log()
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns also the belief, the last levels of the way, and some of each arm."""
+        """Returns also the belief, the last levels of the bridge, and some of each arm."""
         beliefs = [belief.state_dict() for belief in self._beliefs]
         last, some = (
             {name: packed(levels) for name, levels in of.items()} for of in (self._last, self._some)
@@ -282,8 +285,8 @@ class AdaptiveMixture(Curriculum):
         target = low + (HIGH - low) * self._best / (self._best + half)
         if self._target is None:
             target = torch.zeros_like(target)
-        way = (WAY_AT_ONCE + skill / 2).clamp(WAY_LEAST, WAY_MOST)
-        shares = torch.stack([target, (1 - target) * (1 - way), (1 - target) * way], -1)
+        bridge = (BRIDGE_AT_ONCE + skill / 2).clamp(BRIDGE_LEAST, BRIDGE_MOST)
+        shares = torch.stack([target, (1 - target) * (1 - bridge), (1 - target) * bridge], -1)
         self._shown |= {
             "shares": {arm: shares[:, i].tolist() for i, arm in enumerate(ARMS)},
             "target_success": self._best.tolist(),
@@ -296,16 +299,16 @@ class AdaptiveMixture(Curriculum):
         """Returns levels [n] of one student in a random order, and their arms."""
         draw = streams.generator("levels")
         arms = allotted(shares, count, draw)
-        target, uniform, way = torch.bincount(arms, minlength=len(ARMS)).tolist()
+        target, uniform, bridge = torch.bincount(arms, minlength=len(ARMS)).tolist()
         parts = [self._space.sample(uniform, draw)]
         if target and self._target is not None:
             parts = [self._target.sample(target, draw), *parts]
-        if way:
-            parts.append(self._way(k, way, draw))
+        if bridge:
+            parts.append(self._bridge(k, bridge, draw))
         order = torch.randperm(count, generator=draw)
         return torch.cat(parts)[order], arms[order]
 
-    def _way(self, k: int, count: int, draw: torch.Generator) -> Levels:
+    def _bridge(self, k: int, count: int, draw: torch.Generator) -> Levels:
         """Returns levels [n] that are mastered, and near to the target."""
         goal = self._space if self._target is None else self._target
         targets = goal.sample(count, draw)
@@ -337,7 +340,7 @@ class AdaptiveMixture(Curriculum):
         return self._last[str(k)]
 
     def _candidates(self, k: int, count: int, targets: Levels, draw: torch.Generator) -> Levels:
-        """Returns levels [n] of the space and, if it can tell, between the last way and targets."""
+        """Returns levels [n] of the space and, if it can, between the last bridge and targets."""
         space: Any = self._space
         if self._is_data:  # none twice, where there are enough
             order = torch.randperm(space.size, generator=draw)

@@ -33,7 +33,7 @@ class BinCurriculum(Curriculum):
 
     shown: ClassVar[Sequence[str]] = ("score",)
     """Scores that are logged."""
-    remembers: ClassVar[tuple[str, ...]] = ("scores", "_counts", "_proposed", "_inbox")
+    state: ClassVar[tuple[str, ...]] = ("scores", "_counts", "_proposed", "_inbox")
 
     @checked
     def __init__(self, space: Space, *, every: Count) -> None:

@@ -28,7 +28,9 @@ class Combinator(LearnedCurriculum):
     def __init__(self, parts: Sequence[Curriculum]) -> None:
         self.parts = list(parts)
         self.needs = tuple(dict.fromkeys(need for part in parts for need in part.needs))
-        self.reads = tuple(dict.fromkeys(entry for part in parts for entry in part.reads))
+        self.required_results = tuple(
+            dict.fromkeys(entry for part in parts for entry in part.required_results)
+        )
         self.trains_replicas = any(part.trains_replicas for part in self._learned())
 
     def improve(self, student: Student, streams: Sequence[Streams]) -> dict[str, Any]:
@@ -99,7 +101,7 @@ class Filtered(Combinator):
         if _mixes(curriculum):
             raise ValueError("filter the curricula of a mixture, each by itself, not the mixture")
         self.needs = tuple(dict.fromkeys((*self.needs, *scorer.needs)))
-        self.reads = tuple(dict.fromkeys((*self.reads, *scorer.plays_for)))
+        self.required_results = tuple(dict.fromkeys((*self.required_results, *scorer.plays_for)))
         self._scorer, self._times, self._temperature = scorer, times, temperature
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
@@ -129,7 +131,7 @@ class Schedule(Combinator):
         ArgumentError: if ``until`` is not ascending or does not fit the stages.
     """
 
-    remembers = ("_proposed",)
+    state = ("_proposed",)
 
     @checked
     def __init__(self, stages: Sequence[Curriculum], until: list[int]) -> None:

@@ -99,7 +99,8 @@ def outcome_of(rollout: TensorDictBase) -> TensorDict:
       ``is_step`` bool [K, n, T] where episodes are filled up to one length;
     - ``score`` float, where the loop itself says how much there is to learn on a level.
 
-    Only ``return`` must be there; curricula name others that they cannot do without (``reads``).
+    Only ``return`` must be there; a curriculum names others that it cannot do without, its
+    ``required_results``.
     """
     done = rollout["next", "done"].squeeze(-1)
     episodes = done.sum(-1)
@@ -122,16 +123,16 @@ class Curriculum:
 
     Attributes:
         needs: names of what it asks of a student; see :class:`~proposer_rl.curricula.Student`.
-        reads: entries of an outcome, beside the return, that it cannot do without: ``success``,
-            ``rollout``.
-        remembers: names of its attributes that a resumed run needs: numbers, texts, tensors, lists
+        required_results: entries of an outcome, beside the return, that it cannot do without:
+            ``success``, ``rollout``.
+        state: names of its attributes that a resumed run needs: numbers, texts, tensors, lists
             and dicts of these, and objects with a state of their own. Others are for
             :meth:`state_dict`.
     """
 
     needs: tuple[str, ...] = ()
-    reads: tuple[str, ...] = ()
-    remembers: ClassVar[tuple[str, ...]] = ()
+    required_results: tuple[str, ...] = ()
+    state: ClassVar[tuple[str, ...]] = ()
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """Returns levels for the students to train on next.
@@ -170,11 +171,11 @@ class Curriculum:
         """Returns all that a resumed run needs, in nested dicts of tensors, numbers and strings."""
         kind: Any = type(self)
         _warn_of_nothing(kind)
-        return {name.strip("_"): saved(getattr(self, name)) for name in self.remembers}
+        return {name.strip("_"): saved(getattr(self, name)) for name in self.state}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Puts back what :meth:`state_dict` returned."""
-        for name in self.remembers:
+        for name in self.state:
             setattr(self, name, restored(state[name.strip("_")], getattr(self, name)))
 
     def close(self) -> None:
@@ -295,12 +296,12 @@ class Inbox:
 def _warn_of_nothing(kind: type[Curriculum]) -> None:
     """Warns, once, of a class that observes and does not say what of that is to be saved."""
     said = kind.state_dict is not Curriculum.state_dict or any(
-        "remembers" in vars(parent) for parent in kind.__mro__ if parent is not Curriculum
+        "state" in vars(parent) for parent in kind.__mro__ if parent is not Curriculum
     )
     if kind.observe is not Curriculum.observe and not said:
         warnings.warn(
             f"{kind.__name__} observes, but a resumed run begins anew: name the attributes to be "
-            "saved, remembers = (...), or () for none",
+            "saved, state = (...), or () for none",
             stacklevel=3,
         )
 

@@ -126,7 +126,7 @@ class OutcomeModel:
         half_life: batches after which a row counts half.
 
     Attributes:
-        reads: entries of an outcome that it takes in.
+        required_results: entries of an outcome that it takes in.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class OutcomeModel:
     ) -> None:
         self._labels, self._ridge, self._half_life = labels, ridge, half_life
         # Outcomes do not always have an entry that nobody needs.
-        self.reads = ("return", "success") if labels == "success" else ("return",)
+        self.required_results = ("return", "success") if labels == "success" else ("return",)
         self._batches: list[dict[str, Tensor]] = []
         self._worst = torch.tensor(torch.inf, dtype=torch.float64)  # [K, 1], once there is a row
         self._fitted: _Fitted | None = None
@@ -144,10 +144,10 @@ class OutcomeModel:
 
         Args:
             features: float64 [K, m, F]; a constant one is a further intercept.
-            outcome: what it ``reads``, float64 [K, m].
+            outcome: what it ``required_results`` names, float64 [K, m].
             as_old: whether it is as old as the batch before it, and a part of that.
         """
-        batch = {"features": features, **{name: outcome[name] for name in self.reads}}
+        batch = {"features": features, **{name: outcome[name] for name in self.required_results}}
         if as_old:
             *self._batches, before = self._batches
             batch = {name: torch.cat([before[name], batch[name]], 1) for name in batch}
@@ -196,7 +196,7 @@ class OutcomeModel:
     def _fit(self) -> _Fitted:
         entries = {
             name: torch.cat([batch[name] for batch in self._batches], 1)
-            for name in ("features", *self.reads)
+            for name in ("features", *self.required_results)
         }
         ages = torch.cat(
             [
@@ -235,7 +235,7 @@ class Modelled(Combinator):
         labels, ridge, half_life: see the model.
     """
 
-    remembers = ("_model", "_inbox", "_seen", "_has_taken")
+    state = ("_model", "_inbox", "_seen", "_has_taken")
 
     @checked
     def __init__(
@@ -249,8 +249,8 @@ class Modelled(Combinator):
     ) -> None:
         super().__init__([curriculum])
         self.needs = tuple(need for need in self.needs if need not in ANSWERED)
-        if labels == "success" and "success" not in self.reads:
-            self.reads = (*self.reads, "success")
+        if labels == "success" and "success" not in self.required_results:
+            self.required_results = (*self.required_results, "success")
         self._features, self._labels = features, labels
         self._model = OutcomeModel(labels=labels, ridge=ridge, half_life=half_life)
         self._inbox = Inbox()
@@ -269,7 +269,7 @@ class Modelled(Combinator):
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Keeps the outcome for the model, and passes it on to the curriculum."""
         self._inbox.check(batch, outcome)
-        reached = {name: outcome[name].double() for name in self._model.reads}
+        reached = {name: outcome[name].double() for name in self._model.required_results}
         self.parts[0].observe(student, Batch(batch.levels, batch.notes["notes"]), outcome)
         self._inbox.put(batch, **batch.notes.select("features", "predicted"), **reached)
 

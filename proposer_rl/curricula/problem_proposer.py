@@ -48,7 +48,7 @@ class ProblemProposer(Curriculum):
     """
 
     needs: tuple[str, ...] = ("probe",)
-    remembers: ClassVar[tuple[str, ...]] = ("_metrics", "_counts", "_inbox")
+    state: ClassVar[tuple[str, ...]] = ("_metrics", "_counts", "_inbox")
 
     def __init__(
         self,

@@ -47,7 +47,7 @@ class LearningProgressCurriculum(BinCurriculum):
     """
 
     shown = ("score", "performance")
-    remembers = (*BinCurriculum.remembers, "_episodes", "_probes")
+    state = (*BinCurriculum.state, "_episodes", "_probes")
 
     @checked
     def __init__(
@@ -64,7 +64,7 @@ class LearningProgressCurriculum(BinCurriculum):
     ) -> None:
         super().__init__(space, every=every)
         self.needs = ("performance",) if source == "exact" else ()
-        self.reads = ("success",) if (source, measure) == ("episodes", "success") else ()
+        self.required_results = ("success",) if (source, measure) == ("episodes", "success") else ()
         probed = probes if source == "exact" else 0
         self._source, self._probes = source, Probes(space, probed, measure)
         self._fast, self._slow, self._exploration = fast, slow, exploration

@@ -39,7 +39,7 @@ class ProposerCurriculum(LearnedCurriculum):
         trainer: trains the Proposer; None to leave it as it is.
     """
 
-    remembers = ("_proposed", "_action")
+    state = ("_proposed", "_action")
 
     def __init__(
         self,

@@ -92,7 +92,7 @@ class ReplayCurriculum(Curriculum):
         ArgumentError: if there are to be edits and nothing makes them, or options contradict.
     """
 
-    remembers = ("_scored", "_came_back", "_before", "_inbox")
+    state = ("_scored", "_came_back", "_before", "_inbox")
 
     @checked
     def __init__(
@@ -134,7 +134,9 @@ class ReplayCurriculum(Curriculum):
         # Levels are scored aside where they are new and not trained on, edited, or renewed.
         aside = not train_on_new or edits or renew
         self.needs = scorer.needs if aside else scorer.asks
-        self.reads = (*scorer.reads, "rollout") if self._easy else scorer.reads
+        self.required_results = (
+            (*scorer.required_results, "rollout") if self._easy else scorer.required_results
+        )
         bins = space if new_levels is None else SomeBins(cast(Space, space), new_levels)
         self._new_levels = bins
         self.scorer, self._rule = scorer, rule or ReplayRule()

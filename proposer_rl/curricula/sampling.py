@@ -55,7 +55,7 @@ class SelectionCurriculum(Curriculum):
         ArgumentError: if more are to be kept than are scored.
     """
 
-    remembers = ("scores", "_proposed")
+    state = ("scores", "_proposed")
 
     @checked
     def __init__(
@@ -68,7 +68,7 @@ class SelectionCurriculum(Curriculum):
         every: Count = 10,
         new: Share = 0.5,
     ) -> None:
-        self.needs, self.reads = scorer.needs, scorer.plays_for
+        self.needs, self.required_results = scorer.needs, scorer.plays_for
         self._candidates, self._keep, self._every, self._new = candidates, keep, every, new
         self._new_levels, self.scorer = space, scorer
         self._template = space.sample(1, torch.Generator())[0]

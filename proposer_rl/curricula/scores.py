@@ -179,7 +179,7 @@ class Scorer:
         from_episodes: whether levels are scored by playing on them.
         needs: what scoring levels asks of a student, that nobody trains on.
         asks: what scoring those that were trained on asks of it.
-        reads: entries of an outcome that this needs beside the return.
+        required_results: entries of an outcome that this needs beside the return.
         plays_for: of those, what playing on levels has to tell.
 
     Raises:
@@ -203,12 +203,12 @@ class Scorer:
             raise ArgumentError(f"score={name}: a function of your own needs source=episodes")
         if self.from_episodes:
             self.asks: tuple[str, ...] = ASKS.get(name, ())
-            self.reads: tuple[str, ...] = READS.get(name, ())
+            self.required_results: tuple[str, ...] = READS.get(name, ())
             self.needs: tuple[str, ...] = ("play", *self.asks)
         else:
-            self.asks, self.reads = EXACT[name][0], ()
+            self.asks, self.required_results = EXACT[name][0], ()
             self.needs = self.asks
-        self.plays_for = tuple(entry for entry in self.reads if entry != "rollout")
+        self.plays_for = tuple(entry for entry in self.required_results if entry != "rollout")
 
     def of_outcome(
         self,

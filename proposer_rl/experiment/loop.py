@@ -72,7 +72,7 @@ class Experiment:
         self.learner = learner
         self.student = TaskStudent(task, learner)
         require(self.student, curriculum.needs, type(curriculum).__name__)
-        if "success" in curriculum.reads and "success" not in task.results:
+        if "success" in curriculum.required_results and "success" not in task.results:
             raise NoSuccessError(
                 f"{type(curriculum).__name__}: reads success of episodes, and this task tells "
                 "none, only the return"

@@ -39,7 +39,7 @@ class ActorCritic(TensorDictModuleBase):
         copies: K if parameters and data carry independent replicas as their first dimension
             (:class:`~proposer_rl.models.Population`), None for a single network.
         action_key, log_prob_key, logits_key, value_key: the entries' names.
-        memory: of a head that remembers, the widths of its memory by the entries' names: it reads
+        memory: of a head that state, the widths of its memory by the entries' names: it reads
             them, zeros at first, writes them below ``next``, and goes through time where TorchRL's
             ``recurrent_mode()`` says so (:func:`~proposer_rl.models.memory_actor_critic`).
 

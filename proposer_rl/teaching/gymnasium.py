@@ -12,7 +12,7 @@ from torch import Tensor
 
 from proposer_rl.settings import ArgumentError
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, as_number, entries, stepped
-from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write_attribute
+from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, mismatch, write_attribute
 from proposer_rl.tasks.parameters import SEED
 from proposer_rl.teaching.remote import TeacherClient
 from proposer_rl.teaching.teacher import Teacher
@@ -71,7 +71,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
                 )
             inner = inner.env
         super().__init__(env)
-        if "rollout" in teacher.reads:
+        if "rollout" in teacher.required_results:
             raise ArgumentError("teacher: its curriculum reads rollouts, which this does not give")
         if isinstance(set, str) and set != "options":
             raise ArgumentError(f"set={set!r}: must be attributes, a function or 'options'")
@@ -103,7 +103,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         observation, info = self.env.reset(seed=seed, options=options)
         if isinstance(self._how, Mapping):
             for name, path in self._how.items():
-                if line := stray(self.env, path, _plain(self._level[name])):
+                if line := mismatch(self.env, path, _plain(self._level[name])):
                     raise ArgumentError(
                         f"set.{name}={path!r}: {line}, after a reset; give a function that sets "
                         "it where it stays"
@@ -138,7 +138,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _end(self) -> None:
         """Reports the episode to the teacher."""
         self._note(self._success())
-        needed = self._rule is not None or "success" in self._teacher.reads
+        needed = self._rule is not None or "success" in self._teacher.required_results
         if self._succeeded is None and needed:
             own = {name: self._last[name] for name in self._last.keys() - {"level", "level_id"}}
             known = "gives None of the last info", "the last info has no such entry"

@@ -18,9 +18,9 @@ class TeacherClient:
     other.
     """
 
-    def __init__(self, address: Any, key: bytes, reads: tuple[str, ...]) -> None:
+    def __init__(self, address: Any, key: bytes, required_results: tuple[str, ...]) -> None:
         self._address, self._key = address, key
-        self.reads = reads
+        self.required_results = required_results
         self._connection: Connection | None = None
         self._process = 0
         self._lock = Lock()
@@ -38,7 +38,7 @@ class TeacherClient:
         self._call("drop", ids)
 
     def __reduce__(self) -> Any:
-        return TeacherClient, (self._address, self._key, self.reads)
+        return TeacherClient, (self._address, self._key, self.required_results)
 
     def _call(self, name: str, *arguments: Any, **more: Any) -> Any:
         with self._lock:
@@ -68,7 +68,7 @@ class TeacherServer:
 
     def client(self) -> TeacherClient:
         """Returns a new client."""
-        return TeacherClient(self._listener.address, self._key, self._teacher.reads)
+        return TeacherClient(self._listener.address, self._key, self._teacher.required_results)
 
     def _accept(self) -> None:
         while True:

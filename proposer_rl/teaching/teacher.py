@@ -144,9 +144,9 @@ class Teacher:
         self._server: TeacherServer | None = None
 
     @property
-    def reads(self) -> tuple[str, ...]:
+    def required_results(self) -> tuple[str, ...]:
         """Names of what results must have beside the return: ``success``, ``rollout``."""
-        return self.curriculum.reads
+        return self.curriculum.required_results
 
     def propose(self, n: SupportsIndex) -> Any:
         """Returns levels [n] to be observed together."""
@@ -540,7 +540,7 @@ class Teacher:
                 )
 
     def _require(self, name: str, known: bool, how: str) -> None:
-        if name in self.reads and not known:
+        if name in self.required_results and not known:
             raise ArgumentError(f"{name}: missing: this curriculum reads it; {how}")
 
     def _proposed(self) -> NDArray[np.int64]:

@@ -88,7 +88,7 @@ class LevelTransform(Transform):
         tell: bool = True,
     ) -> None:
         super().__init__(in_keys=[], out_keys=[LEVEL_ID])
-        if tell and "rollout" in teacher.reads:
+        if tell and "rollout" in teacher.required_results:
             raise ArgumentError(
                 "tell=True: this curriculum reads rollouts; give tell=False, and each rollout to "
                 "teacher.observe"
@@ -238,7 +238,7 @@ class LevelTransform(Transform):
         if "success" in after.keys():
             return "success"
         rule = getattr(type(self.parent.base_env), "success_rule", None)
-        if rule is None and self._tells and "success" in self._teacher.reads:
+        if rule is None and self._tells and "success" in self._teacher.required_results:
             raise ArgumentError(
                 "success: missing: this curriculum reads it, and the environment has no such "
                 'entry; give success="terminated", "truncated" or a function'

@@ -1,4 +1,4 @@
-"""The adaptive mixture: its shares by hand, its way by brute force, scripted and learning students.
+"""The adaptive mixture: its shares by hand, its bridge by brute force, scripted students.
 
 What a student does is a function of the level alone or of a skill, so that what is right is known.
 """
@@ -23,13 +23,13 @@ from torch import Tensor
 import proposer_rl as prl
 from proposer_rl.curricula import AdaptiveMixture, Batch, Curriculum, SamplingCurriculum, Student
 from proposer_rl.curricula.adaptive import (
+    BRIDGE,
     FLOOR,
     HIGH,
     LARGE,
     LOW,
     TARGET,
     UNIFORM,
-    WAY,
     allotted,
     assigned,
     together,
@@ -133,7 +133,7 @@ def test_shares_are_those_of_the_formulas(told: bool) -> None:
         seen += teach(curriculum, play, 1, 24 if told else 70, now)  # more than a thousand in all
         log = following(curriculum)[1]
         expected = by_hand(seen, told)
-        shares = [log["shares"][arm][0] for arm in ("target", "uniform", "way")]
+        shares = [log["shares"][arm][0] for arm in ("target", "uniform", "bridge")]
         assert shares == pytest.approx(expected, abs=1e-9)
 
 
@@ -185,11 +185,11 @@ def test_the_way_is_mastered_and_nearer_to_the_target_than_uniform_levels(count:
     teach(curriculum, below(0.5), 12)
     batch, _ = following(curriculum, count)
     arm, p, x = batch.notes["arm"][0], batch.notes["predicted"][0], batch.levels["x"][0]
-    assert len(x[arm == WAY].unique()) == (arm == WAY).sum() > count / 8
-    assert (p[arm == WAY] >= 0.3 - 1e-9).all()
+    assert len(x[arm == BRIDGE].unique()) == (arm == BRIDGE).sum() > count / 8
+    assert (p[arm == BRIDGE] >= 0.3 - 1e-9).all()
     assert (x[arm == TARGET] == 1).all()
-    assert float(x[arm == WAY].mean()) > 0.35 > float(x[arm == WAY].amin())
-    assert float(x[arm == WAY].amax()) < 0.7 < float(x[arm == UNIFORM].amax())
+    assert float(x[arm == BRIDGE].mean()) > 0.35 > float(x[arm == BRIDGE].amin())
+    assert float(x[arm == BRIDGE].amax()) < 0.7 < float(x[arm == UNIFORM].amax())
 
 
 def test_where_too_few_are_mastered_the_best_take_their_place() -> None:
@@ -197,7 +197,7 @@ def test_where_too_few_are_mastered_the_best_take_their_place() -> None:
     teach(curriculum, below(0.02), 12)
     batch, _ = following(curriculum, 512)
     arm, p = batch.notes["arm"][0], batch.notes["predicted"][0]
-    assert (p < 0.3).all() and p[arm == WAY].mean() > 1.3 * p[arm == UNIFORM].mean()
+    assert (p < 0.3).all() and p[arm == BRIDGE].mean() > 1.3 * p[arm == UNIFORM].mean()
 
 
 def shares_after(play: Plays, space: Any = LINE, updates: int = 12) -> dict[str, float]:
@@ -317,7 +317,7 @@ def test_a_belief_gets_what_is_known_of_levels() -> None:
 
 
 def test_items_are_remembered_one_by_one() -> None:
-    """Of 5,000 items without features those that failed lately are hardly on the way."""
+    """Of 5,000 items without features those that failed lately are hardly in the bridge."""
     space = prl.Items(5000, target=list(range(20)))
     curriculum = AdaptiveMixture(space, space.target)
 
@@ -330,11 +330,11 @@ def test_items_are_remembered_one_by_one() -> None:
     arm, item, p = batch.notes["arm"][0], batch.levels["item"][0], batch.notes["predicted"][0]
     known = torch.isin(item, torch.cat(seen))
     failed = torch.isin(item, torch.cat(seen[-10:])) & (item % 2 == 0)
-    way, uniform = (float(failed[arm == one].double().mean()) for one in (WAY, UNIFORM))
-    assert way < 0.7 * uniform  # of what failed long ago a few are tried again
+    bridge, uniform = (float(failed[arm == one].double().mean()) for one in (BRIDGE, UNIFORM))
+    assert bridge < 0.7 * uniform  # of what failed long ago a few are tried again
     assert p[known & (item % 2 == 1)].mean() > p[~known].mean() > p[known & (item % 2 == 0)].mean()
     assert (item[arm == TARGET] < 20).all()
-    assert log["shares"]["way"][0] > 0
+    assert log["shares"]["bridge"][0] > 0
 
 
 PARTS: dict[str, Any] = {

@@ -283,8 +283,8 @@ def test_whoever_observes_and_saves_nothing_is_told_so_once() -> None:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         for kind in (
-            *kinds(remembers=()),
-            *kinds(remembers=("needs",)),
+            *kinds(state=()),
+            *kinds(state=("needs",)),
             *kinds(state_dict=lambda self: {}),
             curricula.SamplingCurriculum,
         ):

@@ -21,10 +21,10 @@ ITEMS = prl.Items(1000)
 class Counting(Curriculum):
     """Levels 0, 1, 2 and so on; what came of each."""
 
-    remembers = ()
+    state = ()
 
     def __init__(self, *reads: str) -> None:
-        self.reads = reads
+        self.required_results = reads
         self.count = 0
         self.seen: dict[int, tuple[float, float]] = {}
         self.rollouts: dict[int, TensorDictBase] = {}

@@ -42,7 +42,7 @@ def test_the_table_is_that_of_the_code(row: str) -> None:
     if name == "hand_designed":
         given = {"distributions": ["easy"], "until": []}
     teacher = prl.Teacher(recipe(**given), ITEMS if "items" in space else RANGES, student=Able())
-    assert list(teacher.reads) == told
+    assert list(teacher.required_results) == told
     assert list(teacher.curriculum.needs) == functions
     if {"bins", "target", "items"} & {*space} or name == "accel":
         with pytest.raises((prl.ArgumentError, TypeError), match=r"bins|target|edits"):

@@ -619,7 +619,7 @@ def test_a_model_reads_success_where_it_is_asked_to() -> None:
         prl.Teacher("model_transport", SPACE, filter=around),
     ):
         assert (
-            teacher.reads == ("success",)
+            teacher.required_results == ("success",)
             and teacher.state_dict()["of"]["curriculum"]["model"] == model
         )
     assert recipe.overrides()[1:] == [

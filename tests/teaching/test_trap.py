@@ -21,7 +21,7 @@ FASTER = 0.035
 class Greedy(prl.Curriculum):
     """Draws what was the most learnable when it was seen last."""
 
-    remembers = ()
+    state = ()
 
     def __init__(self, space: Any) -> None:
         self.space, self.success = space, torch.full((space.size,), 0.5)

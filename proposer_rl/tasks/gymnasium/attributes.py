@@ -68,11 +68,11 @@ def write_attribute(environment: Any, path: str, value: Any) -> None:
             f"{type(holder).__name__} only passes {last!r} on from something inside it, which "
             "would not see another value; name the path to it, as in name: env.gravity"
         )
-    if (line := stray(environment, path, value)) is not None:
+    if (line := mismatch(environment, path, value)) is not None:
         raise AttributeRefusedError(line)
 
 
-def stray(environment: Any, path: str, value: Any) -> str | None:
+def mismatch(environment: Any, path: str, value: Any) -> str | None:
     """Returns a line that says what stands at a path, where it is not this value; else None.
 
     A wrapper that has something there by itself, beside the environment, must have the same.

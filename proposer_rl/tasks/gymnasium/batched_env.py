@@ -23,7 +23,12 @@ from torchrl.envs import EnvBase
 
 from proposer_rl.models import available_cores, check_torch_defaults
 from proposer_rl.tasks.gymnasium.answers import SuccessSettings, UnfitEnvironmentError
-from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, ParameterSettings, Play
+from proposer_rl.tasks.gymnasium.player import (
+    GymLevel,
+    LevelPlayer,
+    MakeEnvironment,
+    ParameterSettings,
+)
 from proposer_rl.tasks.gymnasium.spaces import Layout, in_order
 from proposer_rl.tasks.parameters import SEED
 
@@ -151,12 +156,12 @@ class GymnasiumEnv(EnvBase):
         """Does nothing, as what is random belongs to the levels."""
 
 
-def plays(levels: TensorDictBase) -> list[Play]:
+def plays(levels: TensorDictBase) -> list[GymLevel]:
     """Returns what players are to play for levels [*B], in one row."""
     columns = {str(name): entry.flatten().tolist() for name, entry in levels.items()}
     seeds = columns.pop(SEED)
     return [
-        Play(dict(zip(columns, row, strict=True)), seed)
+        GymLevel(dict(zip(columns, row, strict=True)), seed)
         for seed, *row in zip(seeds, *columns.values(), strict=True)
     ]
 

@@ -16,7 +16,12 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 from proposer_rl.runs.records import written
-from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, ParameterSettings, Play
+from proposer_rl.tasks.gymnasium.player import (
+    GymLevel,
+    LevelPlayer,
+    MakeEnvironment,
+    ParameterSettings,
+)
 from proposer_rl.tasks.parameters import SEED
 
 # Of pygame, with which most environments draw: no greeting, and no window or sound is needed.
@@ -43,7 +48,7 @@ class Camera:
     """
 
     def __init__(
-        self, make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: Play
+        self, make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: GymLevel
     ) -> None:
         try:
             if MODE not in LevelPlayer(make, parameters, play).metadata["render_modes"]:
@@ -56,7 +61,7 @@ class Camera:
         except Exception:  # a package, a display, a driver: the numbers are shown instead
             self.works = False
 
-    def picture(self, play: Play, actions: Tensor | None) -> NDArray[np.uint8]:
+    def picture(self, play: GymLevel, actions: Tensor | None) -> NDArray[np.uint8]:
         """Draws a level, and an episode there with actions [T, ...]: uint8 [H, W, 3]."""
         if self.works:
             try:
@@ -66,7 +71,7 @@ class Camera:
         numbers = [f"{name} {value:.4g}" for name, value in play.values.items()]
         return written(numbers or [f"{SEED} {play.seed}"])
 
-    def _drawn(self, play: Play, actions: Tensor | None) -> NDArray[np.uint8]:
+    def _drawn(self, play: GymLevel, actions: Tensor | None) -> NDArray[np.uint8]:
         self._player.play = play
         self._player.reset()
         frames = [self._frame()]

@@ -22,7 +22,7 @@ from proposer_rl.tasks.gymnasium.answers import (
     UnfitEnvironmentError,
     stepped,
 )
-from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, stray, write_attribute
+from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, mismatch, write_attribute
 from proposer_rl.tasks.gymnasium.spaces import Layout, typed
 from proposer_rl.tasks.parameters import SEED
 from proposer_rl.tasks.ranges import RangeSettings
@@ -117,7 +117,7 @@ class MakeEnvironment:
         return min(limits, default=None)
 
 
-class Play(NamedTuple):
+class GymLevel(NamedTuple):
     """A level: values of the parameters by name, and the seed of every reset."""
 
     values: Mapping[str, float]
@@ -150,7 +150,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         self,
         make: MakeEnvironment,
         parameters: Mapping[str, ParameterSettings],
-        play: Play,
+        play: GymLevel,
         success: SuccessSettings | None = None,
         once: bool = False,
     ) -> None:
@@ -166,12 +166,12 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.last_info: Mapping[str, Any] = {}
 
     @property
-    def play(self) -> Play:
+    def play(self) -> GymLevel:
         """Returns what is played from the next reset on."""
         return self._play
 
     @play.setter
-    def play(self, play: Play) -> None:
+    def play(self, play: GymLevel) -> None:
         self._play, self._played, self._still = play, False, False
 
     @cached_property
@@ -229,10 +229,10 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         info = {"success": True} if over and self._succeeded else {}
         return self._seen, reward, terminated, truncated, info
 
-    def strays(self) -> str | None:
+    def mismatches(self) -> str | None:
         """Returns a line on what of the level the environment has lost; None where all is there."""
         for name, how, path in self._ways:
-            line = how == "attribute" and stray(self.env, path, self._value(name))
+            line = how == "attribute" and mismatch(self.env, path, self._value(name))
             if line:
                 return f"parameters.{name}: {line}"
         return None

@@ -15,10 +15,10 @@ from gymnasium.utils.env_checker import check_env
 from proposer_rl.tasks.gymnasium.answers import SuccessSettings
 from proposer_rl.tasks.gymnasium.pictures import Camera
 from proposer_rl.tasks.gymnasium.player import (
+    GymLevel,
     LevelPlayer,
     MakeEnvironment,
     ParameterSettings,
-    Play,
     wrapper_error,
 )
 from proposer_rl.tasks.gymnasium.spaces import PartTaken, assembled, leaves
@@ -34,7 +34,7 @@ def tried(
     make: MakeEnvironment,
     parameters: Mapping[str, ParameterSettings],
     bins: Mapping[str, Bins],
-    target: Play,
+    target: GymLevel,
     success: SuccessSettings,
 ) -> int:
     """Plays an episode on a level of the target, and short ones at both ends of each parameter.
@@ -97,7 +97,7 @@ def _check_interface(player: LevelPlayer) -> None:
 
 
 def _check_wrappers(
-    make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: Play
+    make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: GymLevel
 ) -> None:
     """Refuses a wrapper after which a level does not play alike twice, though it did before."""
     for count in range(len(make.wrappers) + 1 if make.wrappers else 0):
@@ -130,7 +130,7 @@ def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) ->
         )
 
 
-def _check_values(player: LevelPlayer, name: str, plays: list[Play]) -> None:
+def _check_values(player: LevelPlayer, name: str, plays: list[GymLevel]) -> None:
     """Sets a parameter to values, and checks that they arrive, stay, and change something.
 
     A change of the picture suffices, as it may take skill to meet what differs.
@@ -165,14 +165,14 @@ def _check_values(player: LevelPlayer, name: str, plays: list[Play]) -> None:
         )
 
 
-def _look_alike(player: LevelPlayer, ends: Sequence[Play]) -> bool:
+def _look_alike(player: LevelPlayer, ends: Sequence[GymLevel]) -> bool:
     camera = Camera(player.make, player.parameters, ends[0])
     first, last = (camera.picture(play, None) for play in ends)
     return not camera.works or np.array_equal(first, last)
 
 
 def _refuse_strays(player: LevelPlayer, when: str) -> None:
-    if (line := player.strays()) is not None:
+    if (line := player.mismatches()) is not None:
         raise ValueError(
             f"{line}, {when}: the environment sets it by itself; set it in another way, such as "
             "set: option or set: call"

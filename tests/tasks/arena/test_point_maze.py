@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from proposer_rl.cli.build import make_task
-from proposer_rl.tasks.gymnasium.player import LevelPlayer, Play
+from proposer_rl.tasks.gymnasium.player import GymLevel, LevelPlayer
 from tests.tiny import composed
 
 pytest.importorskip("gymnasium_robotics")
@@ -21,7 +21,7 @@ def test_a_push_from_cell_to_cell_reaches_every_goal() -> None:
     parameters = task._parameters
     first = {name: given.values[0] for name, given in parameters.items()}
     goals = dict(zip(parameters["goal"].values, map(tuple, parameters["goal"].to), strict=True))
-    player = LevelPlayer(task._make, parameters, Play(first, 0), task._success)
+    player = LevelPlayer(task._make, parameters, GymLevel(first, 0), task._success)
     inner: Any = player.unwrapped
     grid = networkx.grid_2d_graph(inner.maze.map_length, inner.maze.map_width)
     grid.remove_nodes_from([*zip(*np.nonzero(np.array(inner.maze.maze_map) == 1), strict=True)])
@@ -30,7 +30,7 @@ def test_a_push_from_cell_to_cell_reaches_every_goal() -> None:
     lengths = [len(ways[cell]) for cell in goals.values()]
     assert lengths == sorted(lengths)
     for goal, cell in goals.items():
-        player.play = Play({**first, "goal": goal}, seed=goal)
+        player.play = GymLevel({**first, "goal": goal}, seed=goal)
         player.reset()
         way = [inner.maze.cell_rowcol_to_xy(np.array(place)) for place in ways[cell]]
         way.append(inner.goal)

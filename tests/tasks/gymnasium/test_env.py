@@ -15,7 +15,7 @@ from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.answers import Step, SuccessSettings
 from proposer_rl.tasks.gymnasium.batched_env import GymnasiumEnv, LostProcessError
-from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, Play
+from proposer_rl.tasks.gymnasium.player import GymLevel, LevelPlayer, MakeEnvironment
 from proposer_rl.tasks.parameters import ParameterSpace
 from tests.tasks.gymnasium.odd import odd
 from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, WALK, set_wind
@@ -129,7 +129,7 @@ def test_successes(settings: Any, expected: list[bool]) -> None:
 def test_a_return_is_reached_up_to_rounding(reward: Any) -> None:
     rule = SuccessSettings(kind="return", least=round(10 * float(reward), 3))
     env = odd(step=lambda self, a: (self.seen(), reward, False, False, {}))
-    player = LevelPlayer(MakeEnvironment(env, max_steps=10), {}, Play({}, 0), rule)
+    player = LevelPlayer(MakeEnvironment(env, max_steps=10), {}, GymLevel({}, 0), rule)
     player.reset()
     assert [player.step(0)[4] for _ in range(10)] == [*[{}] * 9, {"success": True}]
     assert not rule(Step(True, False, True, rule.least - 1e-4, {}))  # type: ignore[operator]

@@ -11,10 +11,10 @@ import pytest
 
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.player import (
+    GymLevel,
     LevelPlayer,
     MakeEnvironment,
     ParameterSettings,
-    Play,
     imported,
 )
 from tests.tasks.gymnasium.toys import LIMIT, NO_BOX2D, PARAMETERS, WALK
@@ -37,15 +37,15 @@ def argument(**more: Any) -> ParameterSettings:
 
 
 def test_each_number_gets_where_it_belongs() -> None:
-    player = LevelPlayer(MakeEnvironment(WALK), PARAMETERS, Play(LEVEL, 7))
+    player = LevelPlayer(MakeEnvironment(WALK), PARAMETERS, GymLevel(LEVEL, 7))
     inner: Any = player.unwrapped
     player.reset(seed=99)
     assert (inner.engine.speed, inner.width, inner.wind) == (1.25, 2.0, -0.1)
     assert inner.kept == [(7, {"start": 1})]
-    player.play = Play({**LEVEL, "wind": 1}, 8)
+    player.play = GymLevel({**LEVEL, "wind": 1}, 8)
     player.reset()
     assert player.unwrapped is inner and inner.wind == 0.1  # nothing had to be built
-    player.play = Play({**LEVEL, "width": 1.0}, 8)
+    player.play = GymLevel({**LEVEL, "width": 1.0}, 8)
     player.reset()
     again: Any = player.unwrapped
     assert again is not inner and (again.width, again.engine.speed) == (1.0, 1.25)
@@ -68,9 +68,9 @@ def test_a_value_may_stand_for_anything(
     env_id: str, way: Any, name: str, to: list[Any], found: Any
 ) -> None:
     given = ParameterSettings(set=way, name=name, values=[1, 5], to=to, target=5)
-    player = LevelPlayer(MakeEnvironment(env_id), {"a": given}, Play({"a": 5}, 7))
+    player = LevelPlayer(MakeEnvironment(env_id), {"a": given}, GymLevel({"a": 5}, 7))
     for value, thing in ((5, to[1]), (5, to[1]), (1, to[0])):
-        player.play = Play({"a": value}, 7)
+        player.play = GymLevel({"a": value}, 7)
         player.reset()
         now = found(player.unwrapped)
         assert now == (thing if name != "desc" else [[*row] for row in thing])
@@ -79,9 +79,9 @@ def test_a_value_may_stand_for_anything(
 
 
 def test_once_it_stands_still_after_an_episode() -> None:
-    player = LevelPlayer(MakeEnvironment(WALK), PARAMETERS, Play(LEVEL, 7), once=True)
+    player = LevelPlayer(MakeEnvironment(WALK), PARAMETERS, GymLevel(LEVEL, 7), once=True)
     for _ in range(2):
-        player.play = Play({**LEVEL, "speed": 0.5}, 7)
+        player.play = GymLevel({**LEVEL, "speed": 0.5}, 7)
         player.reset()
         ends = [player.step(1)[3] for _ in range(LIMIT)]
         assert ends == [False] * (LIMIT - 1) + [True]
@@ -92,7 +92,7 @@ def test_once_it_stands_still_after_an_episode() -> None:
             assert (reward, terminated, truncated) == (0, False, False)
 
 
-def steps(player: LevelPlayer, play: Play, count: int = 40) -> list[np.ndarray]:
+def steps(player: LevelPlayer, play: GymLevel, count: int = 40) -> list[np.ndarray]:
     player.play = play
     numbers = np.random.default_rng(0)
     seen = [np.asarray(player.reset()[0]).ravel()]
@@ -135,12 +135,18 @@ def test_a_level_is_the_same_in_new_and_in_used_environments(
 ) -> None:
     make = MakeEnvironment(env_id, **more)
     one, other = (dict(zip(parameters, row, strict=True)) for row in values)
-    used = LevelPlayer(make, parameters, Play(one, 0))
+    used = LevelPlayer(make, parameters, GymLevel(one, 0))
     played = [
         steps(used, play)
-        for play in (Play(one, 5), Play(other, 9), Play(one, 5), Play(one, 5), Play(other, 5))
+        for play in (
+            GymLevel(one, 5),
+            GymLevel(other, 9),
+            GymLevel(one, 5),
+            GymLevel(one, 5),
+            GymLevel(other, 5),
+        )
     ]
-    fresh = steps(LevelPlayer(make, parameters, Play(other, 1)), Play(one, 5))
+    fresh = steps(LevelPlayer(make, parameters, GymLevel(other, 1)), GymLevel(one, 5))
     for again in (played[2], played[3], fresh):
         assert len(again) == len(played[0])
         assert all(np.array_equal(a, b) for a, b in zip(again, played[0], strict=True))
@@ -151,7 +157,7 @@ def test_a_longer_pole_obeys_the_equations_of_motion() -> None:
     """Barto, Sutton and Anderson 1983, without friction, with the pole's half length and masses."""
     length, mass, force, gravity = 0.8, 0.1, 7.0, 15.0
     values = {"length": length, "force": force, "gravity": gravity}
-    player = LevelPlayer(MakeEnvironment("CartPole-v1"), CARTPOLE, Play(values, 3))
+    player = LevelPlayer(MakeEnvironment("CartPole-v1"), CARTPOLE, GymLevel(values, 3))
     _, speed, angle, turn = map(float, player.reset()[0])
     seen = player.step(1)[0]
     total = 1.0 + mass
@@ -178,7 +184,7 @@ REFUSED = [
 def test_what_the_environment_refuses_is_told(parameters: Any, value: int, message: str) -> None:
     with pytest.raises(UnfitEnvironmentError, match=message):
         player = LevelPlayer(
-            MakeEnvironment(WALK), parameters, Play(dict.fromkeys(parameters, value), 0)
+            MakeEnvironment(WALK), parameters, GymLevel(dict.fromkeys(parameters, value), 0)
         )
         player.reset()
         player.reset()
@@ -193,7 +199,7 @@ def test_what_cannot_be_imported_is_told(name: str) -> None:
 @NO_BOX2D
 def test_stumps_stand_where_they_are_asked_for() -> None:
     """As high and as far apart as the level says, by the bodies in Box2D's world."""
-    play = Play(dict(zip(STUMPS, (1.5, 4.0), strict=True)), 3)
+    play = GymLevel(dict(zip(STUMPS, (1.5, 4.0), strict=True)), 3)
     player = LevelPlayer(MakeEnvironment(TRACK), numbers(*STUMPS), play)
     player.reset()
     inner: Any = player.unwrapped

@@ -22,7 +22,12 @@ from proposer_rl.runs.folder import read_csv
 from proposer_rl.runs.records import TaskFacts, checked
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium import batched_env, pictures
-from proposer_rl.tasks.gymnasium.player import LevelPlayer, MakeEnvironment, ParameterSettings, Play
+from proposer_rl.tasks.gymnasium.player import (
+    GymLevel,
+    LevelPlayer,
+    MakeEnvironment,
+    ParameterSettings,
+)
 from tests.tasks.gymnasium.odd import Line, odd
 from tests.tasks.gymnasium.toys import NO_BOX2D, PARAMETERS, TINY, WALK, Walk, walk_task
 from tests.test_readme import ROOT, commands, write_files
@@ -280,7 +285,7 @@ def test_single_levels_are_of_the_seeds_that_are_measured_on() -> None:
 
 def test_one_parameter_can_set_several_numbers() -> None:
     both = ParameterSettings(name=["engine.speed", "wind"], values=[0.5, 1.0], target=1.0)
-    player = LevelPlayer(MakeEnvironment(WALK), {"both": both}, Play({"both": 0.5}, 0))
+    player = LevelPlayer(MakeEnvironment(WALK), {"both": both}, GymLevel({"both": 0.5}, 0))
     player.reset()
     inner: Any = player.unwrapped
     assert (inner.engine.speed, inner.wind) == (0.5, 0.5)

@@ -36,10 +36,10 @@ from proposer_rl.tasks.gymnasium.attributes import (
 )
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings
 from proposer_rl.tasks.gymnasium.player import (
+    GymLevel,
     LevelPlayer,
     MakeEnvironment,
     ParameterSettings,
-    Play,
 )
 from proposer_rl.tasks.gymnasium.spaces import Layout
 from tests.tasks.gymnasium.odd import LIMIT, Line, Robot, odd, with_parts
@@ -120,7 +120,7 @@ def test_what_would_be_misread_is_refused(members: dict[str, Any], message: str)
     ],
 )
 def test_one_number_in_another_dress_is_that_number(members: dict[str, Any]) -> None:
-    player = LevelPlayer(line_task(odd(**members))._make, GOAL, Play({"goal": 3.0}, 0), TOLD)
+    player = LevelPlayer(line_task(odd(**members))._make, GOAL, GymLevel({"goal": 3.0}, 0), TOLD)
     player.reset()
     played = [player.step(1) for _ in range(LIMIT)]
     reward, ended = played[-1][1:3]
@@ -333,7 +333,9 @@ LATER: list[tuple[Any, Any, Any]] = [
 def test_what_a_space_cannot_hold_is_also_refused_after_the_trial(
     space: Any, first: Any, later: Any
 ) -> None:
-    player = LevelPlayer(MakeEnvironment(odd(**shows(first, space))), GOAL, Play({"goal": 3.0}, 0))
+    player = LevelPlayer(
+        MakeEnvironment(odd(**shows(first, space))), GOAL, GymLevel({"goal": 3.0}, 0)
+    )
     player.reset()
     player.unwrapped.seen = lambda: later  # type: ignore[attr-defined]
     message = r"the environment shows .*; its observation space is .*, on the level goal=3, seed=0"
@@ -346,7 +348,7 @@ def test_what_a_space_cannot_hold_is_also_refused_after_the_trial(
 def test_an_end_that_does_not_tell_success_is_refused_after_the_trial_too(info: Any) -> None:
     tells = {"is_success": False}
     ends = odd(step=lambda self, a: (self.seen(), 0.0, True, False, self.told), told=tells)
-    player = LevelPlayer(MakeEnvironment(ends), GOAL, Play({"goal": 3.0}, 0), TOLD)
+    player = LevelPlayer(MakeEnvironment(ends), GOAL, GymLevel({"goal": 3.0}, 0), TOLD)
     player.reset()
     player.step(0)
     player.unwrapped.told = info  # type: ignore[attr-defined]

@@ -62,7 +62,7 @@ class SelfPacedCurriculum(Curriculum):
         ValueError: for an unknown axis, or a space that has no points.
     """
 
-    remembers = ("means", "deviations", "_episodes", "_expected", "_counts", "_inbox")
+    state = ("means", "deviations", "_episodes", "_expected", "_counts", "_inbox")
 
     @checked
     def __init__(
@@ -81,7 +81,7 @@ class SelfPacedCurriculum(Curriculum):
         rounded: bool = True,
     ) -> None:
         self.space, self._points = space, Points(space, rounded)
-        self.reads = ("success",) if measure == "success" else ()
+        self.required_results = ("success",) if measure == "success" else ()
         self._limits = delta, epsilon, least_deviation
         self._every, self._measure = episodes, measure
         if rounded:

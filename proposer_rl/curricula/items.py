@@ -42,8 +42,8 @@ class ItemCurriculum(Curriculum):
         space: of N items, or with N bins.
     """
 
-    reads = ("success",)
-    remembers: ClassVar[tuple[str, ...]] = ("_inbox", "numbers", "_seen")
+    required_results = ("success",)
+    state: ClassVar[tuple[str, ...]] = ("_inbox", "numbers", "_seen")
 
     def __init__(self, space: Space) -> None:
         refuse_unfit_bins(space)

@@ -16,7 +16,7 @@ from tensordict import TensorDict
 
 import proposer_rl as prl
 from proposer_rl.curricula import Curriculum, Student
-from proposer_rl.curricula.prompts import PRIOR, ItemCurriculum, arc_length, nearest, wanted_arc
+from proposer_rl.curricula.items import PRIOR, ItemCurriculum, arc_length, nearest, wanted_arc
 from proposer_rl.curricula.scores import mixed
 from proposer_rl.streams import Streams
 

@@ -61,7 +61,7 @@ class MixtureCurriculum(Curriculum):
             space has a single bin.
     """
 
-    remembers = ("_history", "_mixtures", "_fitted", "_counts", "_drawn", "_inbox")
+    state = ("_history", "_mixtures", "_fitted", "_counts", "_drawn", "_inbox")
 
     @checked
     def __init__(

@@ -45,7 +45,7 @@ class RowsCurriculum(Curriculum):
         ArgumentError: for an unknown axis, one of a single row, or ``lower`` above ``upper``.
     """
 
-    remembers = ("_queue", "_counts", "_last", "_inbox")
+    state = ("_queue", "_counts", "_last", "_inbox")
 
     @checked
     def __init__(
@@ -72,7 +72,7 @@ class RowsCurriculum(Curriculum):
         # The number of a bin is (before * rows + row) * after + rest.
         self._before, self._after = prod(sizes[:axis]), prod(sizes[axis + 1 :])
         self.space, self._start = space, min(start, self._rows - 1)
-        self.reads = ("success",) if measure == "success" else ()
+        self.required_results = ("success",) if measure == "success" else ()
         self._lower, self._upper, self._measure = lower, upper, measure
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._last = torch.zeros(0, dtype=torch.int64)  # rows of the last batch, [K, n]

@@ -55,7 +55,7 @@ class TransportCurriculum(BinCurriculum):
 
     shown = ("performance",)
     needs = ("performance",)
-    remembers = (*BinCurriculum.remembers, "_probes")
+    state = (*BinCurriculum.state, "_probes")
 
     @checked
     def __init__(

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from sklearn.mixture import GaussianMixture
 
 from proposer_rl.curricula import gaussians, points
-from proposer_rl.curricula.gaussians import (
+from proposer_rl.curricula.alp_gmm import (
     MixtureCurriculum,
     absolute_progress,
     draw_points,
@@ -226,6 +226,6 @@ def test_performance_is_that_before_the_update_and_counted() -> None:
 
 
 def test_without_scikit_learn_a_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("proposer_rl.curricula.gaussians.find_spec", lambda name: None)
+    monkeypatch.setattr("proposer_rl.curricula.alp_gmm.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"install it with: .*\[alp-gmm\]'?$"):
         small(Scripted(torch.zeros(1, 3)))

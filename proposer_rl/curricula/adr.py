@@ -54,7 +54,7 @@ class BoundsCurriculum(Curriculum):
         ValueError: for an unknown axis, ``lower`` above ``upper``, or a space that has no points.
     """
 
-    remembers = ("bounds", "_sums", "_played", "_counts", "_inbox")
+    state = ("bounds", "_sums", "_played", "_counts", "_inbox")
 
     @checked
     def __init__(
@@ -72,7 +72,7 @@ class BoundsCurriculum(Curriculum):
     ) -> None:
         refuse_crossed(lower, upper)
         self.space, self._points = space, Points(space, rounded)
-        self.reads = ("success",) if measure == "success" else ()
+        self.required_results = ("success",) if measure == "success" else ()
         self._start, self._step = self._points.at(start), step
         self._lower, self._upper = lower, upper
         self._episodes, self._boundary, self._measure = episodes, boundary, measure
