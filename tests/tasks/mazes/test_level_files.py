@@ -252,5 +252,3 @@ def test_the_levels_of_a_run_are_read_from_its_record(tmp_path: Path) -> None:
         "seed_3_update_00010_2",
         "seed_4_update_00020_1",
     ]
-
-
