@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -17,6 +18,7 @@ examples:
   bin/report sweeps/quick -o results/quick
   bin/report a b c --threshold 0.5         three runs; sample efficiency at 50 %
   bin/report sweeps/quick --baseline target   everything measured against that method
+  bin/report outputs --compare perf_gain,plr  one comparison was planned: p corrects for it alone
   bin/report outputs results/medium        your runs beside published ones
   bin/report plr.jsonl uniform.jsonl       logs of teachers, teacher.log(file)
 
@@ -45,6 +47,7 @@ def _run(options: argparse.Namespace) -> None:
         options.threshold,
         options.baseline or (),
         progress=not options.quiet,
+        compare=re.split(r",(?! )", options.compare) if options.compare else (),
         meanings={group: choices(group, [CONFIG_FOLDER]) for group in ("method", "ablation")},
     )
     print(printable(f"Report: {page}"))
@@ -78,6 +81,12 @@ def _parser() -> argparse.ArgumentParser:
         help="what the others are measured against, as the report calls it (default: "
         "domain_randomization, else the first); again for more, of which several tasks take the "
         "better one (default: domain_randomization and target)",
+    )
+    parser.add_argument(
+        "--compare",
+        metavar="METHOD,METHOD",
+        help="the methods whose comparison was planned, as the report calls them: p-values are "
+        "corrected for these alone (default: for all methods)",
     )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
     return parser

@@ -12,7 +12,8 @@ import numpy as np
 from matplotlib.figure import FigureBase
 
 from proposer_rl.report import statistics
-from proposer_rl.report.comparisons import difference, primary
+from proposer_rl.report.comparisons import TOO_FEW, Decision, difference, primary
+from proposer_rl.report.outcomes import Row, cost, factors, signed
 from proposer_rl.report.statistics import ERROR, FEWEST, Estimate
 from proposer_rl.report.studies import USUAL_BASELINE, Study
 from proposer_rl.report.style import BLUE, VERMILLION, Drawing
@@ -91,24 +92,68 @@ class Arena:
         found = (self.difference(task, one, other) for task in self.tasks)
         return [each for each in found if each is not None]
 
+    @cached_property
+    def rows(self) -> list[Row]:
+        """Every method beside the first baseline, in the mean over tasks; the best first.
+
+        Methods that lack a task come after those that have all.
+        """
+        baseline, found = self.baselines[0], self.found
+        planned = {label for study in self.tasks.values() for label in study.planned}
+        asked = [label for label in found if label != baseline and label in (planned or found)]
+        every = {label: self._common(label, baseline) for label in found}
+        means = {label: statistics.mean_of_estimates(own) for label, own in every.items() if own}
+        asked = [label for label in asked if label in means]
+        corrected = dict(zip(asked, statistics.holm([means[a].p for a in asked]), strict=True))
+        count = sum(not math.isnan(p) for p in corrected.values())
+        rows = []
+        for label, mean in means.items():
+            p, alone, between = corrected.get(label, math.nan), mean.p, mean.interval()
+            tasks, costs = len(every[label]), self._factors(label, baseline)
+            name = label if tasks == len(self.tasks) else f"{label} ({tasks} tasks)"
+            leader = name if mean.value > 0 else baseline
+            decision = Decision(None, TOO_FEW, p, "", None, alone, count, leader)
+            where = f"In the mean over {tasks} tasks {label} differs from {baseline} by"
+            rows.append(
+                Row(
+                    name,
+                    between,
+                    None if label == baseline else decision,
+                    label in asked,
+                    f"{where} {signed(between)}, at {cost(*costs)}",
+                    f"{write(_worst(found[label]).value)} {_worst_task(found[label])}",
+                    *costs,
+                )
+            )
+        return sorted(
+            rows, key=lambda row: (row.label.endswith(" tasks)"), -row.difference.estimate)
+        )
+
+    def _factors(self, one: str, other: str) -> list[float]:
+        """Returns geometric means over tasks of the factors of frames and seconds."""
+        groups = ([study.group(each) for each in (one, other)] for study in self.tasks.values())
+        found = [factors(a, b) for a, b in groups if a and b]
+        return np.exp(np.log(found).mean(0)).tolist()
+
 
 def arena(studies: Sequence[Study], baselines: Sequence[str] = ()) -> Arena | None:
     """Returns the tasks that have all baselines and measure a rate; None for fewer than two.
 
     Args:
         studies: each a task.
-        baselines: labels; of none uniform levels and the target alone.
+        baselines: labels; of none uniform levels and the target alone, or the one that was run.
     """
-    chosen = tuple(baselines or USUAL_BASELINES)
-    fit = [
-        study
-        for study in studies
-        if is_rate(study.headline) and all(study.group(label) for label in chosen)
-    ]
-    if len(fit) < 2:
-        return None
-    names = _names(fit)
-    return Arena(dict(sorted(zip(names, fit, strict=True))), chosen)
+    for chosen in [tuple(baselines)] if baselines else [USUAL_BASELINES, *zip(USUAL_BASELINES)]:
+        fit = [
+            study
+            for study in studies
+            if is_rate(study.headline)
+            and len(study.compared) > 1
+            and all(study.group(label) for label in chosen)
+        ]
+        if len(fit) > 1:
+            return Arena(dict(sorted(zip(_names(fit), fit, strict=True))), chosen)
+    return None
 
 
 def summary(arena: Arena) -> Table:
@@ -137,15 +182,28 @@ def summary(arena: Arena) -> Table:
     note = (
         f"Differences to {arena.reference} in the mean of the headline along training; the better "
         "one is that of the higher mean on the task, so that differences are rather too low than "
-        "too high. Worst case: the lowest over tasks, with its 95 % interval; lowest end: of all "
-        "tasks' intervals. Mean: all tasks count alike and are taken as they are, so that its 95 % "
-        "interval is over seeds: squared errors of the tasks add up, with Satterthwaite's degrees "
-        "of freedom. p: of the mean difference between the first method and each other, on the "
+        "too high. Worst case: the lowest over tasks, with its 95 % interval. Mean: all tasks "
+        "count alike and are taken as they are, so that its 95 % interval is over seeds: squared "
+        "errors of the tasks add up, with Satterthwaite's degrees of freedom. p: of the mean "
+        "difference between the first method and each other, on the "
         "tasks that both have, in pairs of runs where seeds agree; by Student's t with the same "
         "errors, two-sided, corrected for the number of methods (Holm). Intervals are not "
         "corrected. Methods that lack a task come last."
     )
-    return Table("arena", f"Worst case and mean over {every} tasks", note, rows)
+    aside = ["lowest end", "the end's task"]
+    return Table("arena", f"Worst case and mean over {every} tasks", note, rows, aside)
+
+
+def about_rows(arena: Arena) -> str:
+    """Returns what must be known to read the first table."""
+    count = sum(row.asked for row in arena.rows)
+    return (
+        "Difference: of the means along training over seeds, method minus "
+        f"{arena.baselines[0]}, in the mean over tasks, which count alike, with a 95 % interval, "
+        "not corrected; by it methods are in order. p: corrected for all comparisons with the "
+        f"baseline, {count} (Holm). Worst task: its difference to {arena.reference}. ×: times what "
+        "the baseline spent, the curriculum's frames included, geometric means over tasks."
+    )
 
 
 def task_table(arena: Arena) -> Table:
@@ -174,19 +232,21 @@ def task_table(arena: Arena) -> Table:
     return Table("arena_tasks", "Task by task", note, rows)
 
 
-def answer(arena: Arena) -> tuple[str, str]:
-    """Returns two sentences: the method of the best worst case, and how it compares in the mean."""
+def answer(arena: Arena) -> list[str]:
+    """Returns how the best method compares to the baseline, and which has the best worst case."""
+    lead = next((row.sentence for row in arena.rows if row.asked), "")
     first, found = next(iter(arena.found.items()))
     worst = write(_worst(found).interval())
     beaten = [p <= ERROR and lead.value > 0 for lead, p in arena.leads.values()]
     lost = [label for label, (lead, p) in arena.leads.items() if p <= ERROR and lead.value < 0]
     behind = f", and significantly worse than {', '.join(lost)}" if lost else ""
-    return (
+    return [
+        *filter(None, [lead]),
         f"Of {len(arena.found)} methods on {len(arena.tasks)} tasks, {first} has the best worst "
         f"case: a difference of {worst} to {arena.reference}, on {_worst_task(found)}.",
         f"In the mean over tasks it is significantly better than {sum(beaten)} of the "
         f"{len(beaten)} others{behind}.",
-    )
+    ]
 
 
 def differences(arena: Arena) -> Drawing:

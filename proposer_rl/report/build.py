@@ -51,17 +51,21 @@ SELECTION = {
 
 
 def read_checked(
-    folders: Sequence[Path], threshold: float | None, baselines: Sequence[str]
+    folders: Sequence[Path],
+    threshold: float | None,
+    baselines: Sequence[str],
+    compare: Sequence[str] = (),
 ) -> tuple[list[Study], list[str]]:
     """Returns the studies of the runs in some folders and notes; see :func:`write_report`."""
     first, found = next(iter(baselines), None), find_runs(folders)
-    studies, notes = read_studies(found, threshold, first)
+    studies, notes = read_studies(found, threshold, first, compare)
     unmeasured = {path for folder in folders for path in begun(folder)} - {*found}
     notes += [f"not read: {path.name}: it has measured nothing" for path in sorted(unmeasured)]
     labels = sorted({group.label for study in studies for group in study.compared})
-    for baseline in baselines:
-        if baseline not in labels:
-            raise OutputError(f"--baseline={baseline}: must be one of {', '.join(labels)}")
+    for option, given in (("baseline", baselines), ("compare", compare)):
+        for label in given:
+            if label not in labels:
+                raise OutputError(f"--{option}={label}: must be one of {'; '.join(labels)}")
     for study in studies:
         if threshold is not None and not can_reach(study.headline, threshold):
             raise OutputError(f"--threshold={threshold:g}: must be above 0 and at most 1")
@@ -75,6 +79,7 @@ def write_report(
     baselines: Sequence[str] = (),
     progress: bool = True,
     meanings: Meanings | None = None,
+    compare: Sequence[str] = (),
 ) -> Path:
     """Writes a report and returns the path of its page.
 
@@ -88,12 +93,14 @@ def write_report(
         progress: whether to draw a progress bar.
         meanings: what methods and ablations do, by ``method`` or ``ablation`` and name, for runs
             that do not tell.
+        compare: labels of the methods whose comparison was planned: p-values are corrected for
+            these alone; of none for all methods.
     """
     check_output(output, PAGE, f"{TABLES}/runs.csv")
     logs = [path for path in folders if path.suffix == LOG]
     curves = teachers.read_curves(logs)
     of_runs = [path for path in folders if path.suffix != LOG]
-    studies, notes = read_checked(of_runs, threshold, baselines) if of_runs else ([], [])
+    studies, notes = read_checked(of_runs, threshold, baselines, compare) if of_runs else ([], [])
     files: dict[str, bytes] = {}
     sections: list[page.Section] = []
     title = "Curricula: what the runs show"
@@ -117,7 +124,7 @@ def write_report(
         still = [page.figure(one, _drawn(one, "", files)) for one in drawings]
         told = {"notes": curves.notes, "figures": still}
         parts.append(page.of_teachers(drawings, curves.notes, f"{FIGURES}/"))
-    command = page.report_command("bin/report", folders, threshold, baselines)
+    command = page.report_command("bin/report", folders, threshold, baselines, compare=compare)
     html = page.render(
         title=title,
         command=command,
@@ -148,11 +155,14 @@ def check_output(output: Path, *signs: str) -> None:
 
 def _over_tasks(compared: arena.Arena, files: dict[str, bytes]) -> page.Section:
     """Returns the page's section on several tasks, and adds its files to ``files``."""
+    first = page.first_of_tasks(compared)
     tables = [arena.summary(compared), arena.task_table(compared)]
-    _add(tables, "", files)
+    _add([first, *tables], "", files)
+    planned = [label for study in compared.tasks.values() for label in study.planned]
     drawing = arena.differences(compared)
     return {
         "answer": arena.answer(compared),
+        "first": page.first(first, compared.rows, (), planned),
         "summary": tables[0],
         "tasks": tables[1],
         "figure": page.figure(drawing, _drawn(drawing, "", files)),
@@ -179,7 +189,8 @@ def _section(
     """Returns the page's section on a study, and adds its files to ``files``."""
     methods = outcomes.group_table(study)
     tables = [outcomes.comparison_table(study), outcomes.run_table(study)]
-    _add([methods, *tables], prefix, files)
+    first, labels = page.first_of_study(study), [group.label for group in study.groups]
+    _add([first, methods, *tables], prefix, files)
     named = [(group.label, run) for group in study.groups for run in group.runs]
     rows = runs.tables(named, "method")
     files |= {f"{TABLES}/{prefix}{name}.csv": runs.to_csv(own) for name, own in rows.items()}
@@ -195,13 +206,14 @@ def _section(
         "study": study,
         "headline": words(study.headline),
         "answer": answer(study),
+        "first": page.first(first, outcomes.first_rows(study), labels, study.planned),
         "rate": is_rate(study.headline),
         "few": FEWEST,
         "held": f"{HELD:.0%}",
         "facts": page.facts(study),
         "origin": page.origin(study),
         "incomplete": page.incomplete(study),
-        "looks": page.methods(study, meanings),
+        "meanings": page.methods(study, meanings),
         "data": page.pack(json.dumps(data, allow_nan=False, separators=(",", ":"))),
         "staged": data["stages"] is not None,
         "single": bool(data["levels"]),

@@ -18,7 +18,6 @@ from proposer_rl.report.measures import Measure, Series, axis_text
 from proposer_rl.report.runs import Run, share_map
 from proposer_rl.report.statistics import median_of
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.style import DASHES
 from proposer_rl.runs.folder import is_rate
 from proposer_rl.runs.records import LevelRecord, Record, number, picture
 
@@ -35,24 +34,16 @@ def charts(study: Study) -> dict[str, Json]:
     """Returns everything that the page draws of a study, ready for JSON.
 
     Returns:
-        ``methods``: each with its look and seeds. ``axes``: what can be on the abscissa.
+        ``methods``: each with its seeds. ``axes``: what can be on the abscissa.
         ``measures``: each by axis with median and interval of every method, ``rows`` of its runs,
         and their ``seeds``; null where there is none.
-        ``outcomes``: each with an estimate and the runs' values. ``levels``: of every measurement
+        ``outcomes``: each with the mean and the runs' values. ``levels``: of every measurement
         that two methods have for single levels what each reaches there, null without records.
         ``baseline``: the method's number. ``headline``: its name, and whether it is a rate.
         ``stages``: what the slider shows, null without any.
     """
     return {
-        "methods": [
-            {
-                "label": group.label,
-                "colour": group.look.colour,
-                "dash": DASHES[group.look.dash],
-                "seeds": group.seeds,
-            }
-            for group in study.groups
-        ],
+        "methods": [{"label": group.label, "seeds": group.seeds} for group in study.groups],
         "axes": [measures.UPDATES, *measures.COSTS],
         "measures": [_measure(study, each) for each in measures.every(study)],
         "outcomes": _outcomes(study),
@@ -111,14 +102,14 @@ def _series(series: Series | None) -> Json:
 
 
 def _outcomes(study: Study) -> list[Json]:
-    """Returns each outcome with the methods' estimates and the values of their runs."""
+    """Returns each outcome with the methods' means over seeds and the values of their runs."""
     return [
         {
             "name": outcome.name,
             "sign": outcome.sign,
             "methods": [
                 {
-                    "estimate": plain(_estimate(study, group, outcome)),
+                    "mean": plain(_mean(study, group, outcome)),
                     "values": plain(outcome.value(run.until(study.horizon)) for run in group.runs),
                 }
                 for group in study.groups
@@ -128,10 +119,11 @@ def _outcomes(study: Study) -> list[Json]:
     ]
 
 
-def _estimate(study: Study, group: Group, outcome: Outcome) -> Sequence[float]:
-    """Returns the median and its interval; empty without a run of full length."""
+def _mean(study: Study, group: Group, outcome: Outcome) -> Sequence[float]:
+    """Returns the mean of the runs of full length; empty without one."""
     whole = study.group(group.label)
-    return (whole and outcome.median(whole)) or ()
+    values = outcome.values(whole) if whole else []
+    return [float(np.mean(values))] if values else []
 
 
 def _stages(study: Study) -> dict[str, Json] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from itertools import combinations
 from typing import NamedTuple
@@ -59,6 +59,9 @@ class Decision(NamedTuple):
         p: corrected for the number of comparisons; NaN where nothing could be tested.
         reason: what it rests on, in words.
         seeds: about how many would decide it; None where it is decided or nothing can be said.
+        alone: p without correction.
+        tests: how many p is corrected for.
+        leader: label of the one with the higher mean; None if it has hardly learnt.
     """
 
     winner: str | None
@@ -66,6 +69,35 @@ class Decision(NamedTuple):
     p: float
     reason: str
     seeds: int | None = None
+    alone: float = math.nan
+    tests: int = 0
+    leader: str | None = None
+
+    def told(self, label: str) -> str:
+        """Returns the decision in the words of one of the two methods, with its p.
+
+        An interval is of one comparison: where it excludes zero and the corrected test decides
+        nothing, both p are told.
+        """
+        if math.isnan(self.p):
+            return self.verdict if self.verdict == TOO_FEW else f"undecided: {self.reason}"
+        if self.p > statistics.ERROR >= self.alone:
+            return (
+                f"undecided: p {p_text(self.p)} in {self.tests} tests, {p_text(self.alone)} alone"
+            )
+        kind = "undecided" if self.p > statistics.ERROR else self.kind(label)
+        return f"{kind}, p {p_text(self.p)}"
+
+    def kind(self, label: str) -> str:
+        """Returns in a word what a method is, where the test decides."""
+        if self.leader is None:
+            return NOT_LEARNT
+        return "better" if self.leader == label else "worse"
+
+
+def p_text(p: float) -> str:
+    """Returns a p-value in two digits."""
+    return "< 0.001" if p < 0.001 else f"{float(f'{p:.2g}'):g}"
 
 
 def primary(study: Study) -> Outcome:
@@ -130,23 +162,37 @@ def learnt(group: Group, name: str, updates: float) -> bool:
 def decisions(study: Study, outcome: Outcome | None = None) -> dict[tuple[str, str], Decision]:
     """Decides for every pair of groups which is better, by their labels in either order.
 
-    The tests of all pairs are corrected together, by Holm's method.
+    The tests of all pairs that were asked for are corrected together, by Holm's method.
 
     Args:
         study: the groups.
         outcome: of which more is better; None for the primary one.
     """
-    outcome = outcome or primary(study)
-    known = {group.label: outcome.known(group) for group in study.compared}
-    pairs = list(combinations(study.compared, 2))
+    decided = _decided(study, combinations(study.asked, 2), outcome or primary(study))
+    return decided | {(other, one): decision for (one, other), decision in decided.items()}
+
+
+def against_baseline(study: Study) -> dict[str, Decision]:
+    """Decides by the primary outcome which methods are better or worse than the baseline.
+
+    Only these tests are corrected together: it is they that were asked for.
+    """
+    baseline = study.baseline
+    pairs = ((group, baseline) for group in study.asked if group.label != baseline.label)
+    return {label: each for (label, _), each in _decided(study, pairs, primary(study)).items()}
+
+
+def _decided(
+    study: Study, pairs: Iterable[tuple[Group, Group]], outcome: Outcome
+) -> dict[tuple[str, str], Decision]:
+    pairs, known = [*pairs], {group.label: outcome.known(group) for group in study.compared}
     found = [difference_between(known[one.label], known[other.label]) for one, other in pairs]
     corrected = statistics.holm([one.p for one in found])
     count = sum(not math.isnan(p) for p in corrected)
-    decided = {}
-    for (one, other), estimate, p in zip(pairs, found, corrected, strict=True):
-        decision = _decide(study, (one, other), known, estimate, p, count)
-        decided[one.label, other.label] = decided[other.label, one.label] = decision
-    return decided
+    return {
+        (one.label, other.label): _decide(study, (one, other), known, estimate, p, count)
+        for (one, other), estimate, p in zip(pairs, found, corrected, strict=True)
+    }
 
 
 def _decide(
@@ -165,13 +211,16 @@ def _decide(
     if math.isnan(p):
         return Decision(None, UNDECIDED, p, "no spread between the runs")
     text = f"p = {p:.2g} after correction for {count} comparisons"
+    winner = pair[0] if estimate.value > 0 else pair[1]
+    leader = winner.label if learnt(winner, study.headline, study.horizon) else None
+    tested = (estimate.p, count, leader)
     if p > statistics.ERROR:
         if runs[0] != runs[1]:
             estimate = statistics.balanced(*values)
         needed = statistics.seeds_needed(estimate, min(runs), statistics.ERROR / count)
         more = f", about {needed:,} seeds each would decide it" if needed else ""
-        return Decision(None, UNDECIDED, p, text + more, needed)
-    winner = pair[0] if estimate.value > 0 else pair[1]
-    if not learnt(winner, study.headline, study.horizon):
-        return Decision(None, NOT_LEARNT, p, f"{text}, but {winner.label} hardly learnt")
-    return Decision(winner.label, f"{winner.label} is better", p, text)
+        return Decision(None, UNDECIDED, p, text + more, needed, *tested)
+    if leader is None:
+        hardly = f"{text}, but {winner.label} hardly learnt"
+        return Decision(None, NOT_LEARNT, p, hardly, None, *tested)
+    return Decision(leader, f"{leader} is better", p, text, None, *tested)

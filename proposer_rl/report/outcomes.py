@@ -1,4 +1,4 @@
-"""The results: tables of groups, pairs and runs, and the two sentences that a reader needs."""
+"""The results: tables of groups, pairs and runs, and the sentences that a reader needs."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,17 +14,20 @@ from proposer_rl.report.comparisons import (
     NOT_LEARNT,
     TOO_FEW,
     Decision,
+    against_baseline,
     at_the_end,
     decisions,
     difference,
     difference_between,
     outcomes,
     primary,
+    waiting_outcome,
 )
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import (
     FEWEST,
     INTERVALS,
+    Interval,
     probability_of_improvement,
 )
 from proposer_rl.report.studies import Group, Study
@@ -42,7 +46,7 @@ def comparison_table(study: Study) -> Table:
     rows: list[dict[str, Cell]] = []
     for number, outcome in enumerate(outcomes(study)):
         known = {group.label: outcome.known(group) for group in study.compared}
-        for one, other in combinations(study.compared, 2):
+        for one, other in combinations(study.asked, 2):
             runs = [known[each.label] for each in (one, other)]
             if not all(runs):
                 continue
@@ -55,6 +59,7 @@ def comparison_table(study: Study) -> Table:
                     "second": other.label,
                     "difference": difference_between(*runs).interval(),
                     "verdict": decision and decision.verdict,
+                    "decision": decision and decision.told(one.label),
                     "p (Holm)": decision and decision.p,
                     "P(first better)": probability_of_improvement(*values),
                     "seeds needed": decision and decision.seeds,
@@ -64,35 +69,149 @@ def comparison_table(study: Study) -> Table:
         f"Only the primary outcome, {primary(study).name}, has verdicts; their p-values are "
         "corrected together for the number of pairs (Holm). Difference of means: first minus "
         "second, with a 95 % interval, not corrected: Student's over pairs of runs where both have "
-        "the same seeds, else Welch's. P(first better): over all pairs of runs, ties count half; "
-        "with Clopper's and Pearson's interval. Seeds needed: per method, about, for a power of "
+        "the same seeds, else Welch's. Seeds needed: per method, about, for a power of "
         "80 % if the true difference is the one seen. With fewer than "
         f"{FEWEST} seeds no interval and no verdict."
     )
-    return Table("comparisons", "Pairwise comparisons", note, rows)
+    aside = ["verdict", "p (Holm)", "P(first better)"]
+    return Table("comparisons", "Pairwise comparisons", note, rows, aside)
 
 
-def against_baseline(study: Study) -> Table:
-    """Returns a table of every group against the baseline, by the primary outcome."""
-    outcome, baseline, decided = primary(study), study.baseline, decisions(study)
-    rows: list[dict[str, Cell]] = []
+class Row(NamedTuple):
+    """A method beside the baseline, as the first table of a report shows it.
+
+    Attributes:
+        label: of the method.
+        difference: of the means over seeds, method minus baseline, with its interval.
+        decision: against the baseline; None for the baseline itself.
+        asked: whether the decision is among those that are corrected together.
+        says: the difference and its cost in words, as far as the decision.
+        reached: updates to the threshold, or what else is shown beside the difference.
+        frames, seconds: as factors of the baseline's.
+    """
+
+    label: str
+    difference: Interval
+    decision: Decision | None
+    asked: bool
+    says: str
+    reached: str
+    frames: float
+    seconds: float
+
+    @property
+    def verdict(self) -> str:
+        """What is decided, with its p; a dash where nothing was asked."""
+        told = self.decision and self.asked and self.decision.told(self.label)
+        return told or "–"
+
+    @property
+    def sentence(self) -> str:
+        """The row in words."""
+        return f"{self.says}, {self.verdict}." if self.asked else f"{self.says}."
+
+
+def first_rows(study: Study) -> list[Row]:
+    """Returns all methods beside the baseline, the highest mean over seeds first."""
+    outcome, baseline = primary(study), study.baseline
+    every = against_baseline(replace(study, planned=(), chosen=baseline.label))
+    found = every | against_baseline(study)
+    asked = {group.label for group in study.asked}
+    rows = []
     for group in study.compared:
-        if group.label != baseline.label:
-            decision = decided[baseline.label, group.label]
-            rows.append(
-                {
-                    "method": group.label,
-                    "difference": difference(outcome, group, baseline).interval(),
-                    "verdict": decision.verdict,
-                    "p (Holm)": decision.p,
-                }
+        between = difference(outcome, group, baseline).interval()
+        costs = factors(group, baseline)
+        says = f"{_reaching(study, group)} {cost(*costs)}; {outcome.name}: {signed(between)}"
+        rows.append(
+            Row(
+                group.label,
+                between,
+                found.get(group.label),
+                group.label in asked,
+                says,
+                " ".join(_reached(study, group)[1:]),
+                *costs,
             )
-    note = (
-        f"{outcome.name}: difference of means, method minus {baseline.label}, with a 95 % "
-        "interval, not corrected; "
-        "p-values are corrected for all pairs of methods (Holm)."
+        )
+    return sorted(rows, key=lambda row: -row.difference.estimate)
+
+
+def factors(group: Group, baseline: Group) -> list[float]:
+    """Returns how many times the frames and the seconds of the baseline a method took."""
+    found = []
+    for spent in (lambda run: run.total_frames[-1], lambda run: run.own_seconds[-1]):
+        own, other = (np.mean([*map(spent, each.runs)]) for each in (group, baseline))
+        found.append(float(own / other) if other > 0 else math.nan)
+    return found
+
+
+def signed(difference: Interval) -> str:
+    """Returns a difference with its sign."""
+    return f"{'+' if difference.estimate > 0 else ''}{write(difference)}"
+
+
+def cost(frames: float, seconds: float) -> str:
+    """Returns in words what a method costs beside the baseline."""
+    return f"{times(frames)}× the frames and {times(seconds)}× the seconds"
+
+
+def times(factor: float) -> str:
+    """Returns a factor in two digits."""
+    return "–" if math.isnan(factor) else f"{float(f'{factor:.2g}'):,g}"
+
+
+def _reached(study: Study, group: Group) -> tuple[bool, str, str]:
+    """Returns whether most runs got to the threshold, the median of their updates, how many did."""
+    got = sum(run.reached(study.headline, study.threshold) >= 0 for run in group.runs)
+    most, median = 2 * got > len(group.runs), waiting_outcome(study).median(group)
+    text = f"{median.estimate:g}" if most and median else f"> {study.horizon}"
+    return most, text, "" if got in (0, len(group.runs)) else f"({got} of {len(group.runs)})"
+
+
+def _reaching(study: Study, group: Group) -> str:
+    """Returns a clause on the updates that a method and the baseline take to the threshold."""
+    (own, *first), (other, *second) = (_reached(study, each) for each in (group, study.baseline))
+    goal = f"{level_text(study.headline, study.threshold)} {words(study.headline)}"
+    name, baseline, within = group.label, study.baseline.label, f"within {study.horizon} updates"
+    takes = f"{baseline} takes {' '.join(second)}".strip()
+    if not own and not other:
+        return f"Neither {name} nor {baseline} reaches {goal} {within}, {name} at"
+    if not own:
+        return f"{name} does not reach {goal} {within}, where {takes}, at"
+    start = f"{name} reaches {goal} after {first[0]} updates {first[1]}".strip()
+    missed = f"{start}, which {baseline} does not within {study.horizon}, at"
+    return f"{start} where {takes}, at" if other else missed
+
+
+def first_table(
+    rows: Sequence[Row], baseline: str, shown: str, note: str, name: str = "baseline"
+) -> Table:
+    """Returns the rows as a table; ``shown`` is the title of what stands beside the difference."""
+    cells: list[dict[str, Cell]] = [
+        {
+            "method": row.label if row.decision else f"{row.label} (baseline)",
+            "difference": row.difference if row.decision else None,
+            "verdict": row.verdict,
+            "p": row.decision and row.decision.alone,
+            "p (Holm)": row.decision.p if row.decision and row.asked else None,
+            shown: row.reached,
+            "frames (×)": times(row.frames),
+            "seconds (×)": times(row.seconds),
+        }
+        for row in rows
+    ]
+    return Table(name, f"Against {baseline}", note, cells, ["p", "p (Holm)"])
+
+
+def about_rows(study: Study) -> str:
+    """Returns what must be known to read the first table."""
+    return (
+        f"Difference: of the means over seeds of {primary(study).name}, method minus "
+        f"{study.baseline.label}, with a 95 % interval, not corrected; by it methods are in order. "
+        f"p: corrected for all comparisons with the baseline, {len(study.asked) - 1} (Holm). "
+        "Updates: the median over seeds, with how many runs got there if not all did. ×: times "
+        "what the baseline spent, the curriculum's frames included."
     )
-    return Table("baseline", f"Against {baseline.label}", note, rows)
 
 
 def group_table(study: Study) -> Table:
@@ -133,10 +252,9 @@ def group_table(study: Study) -> Table:
     note = (
         f"Updates: min(updates, {horizon}) of the runs of full length; measured every "
         "few updates, so never exact. Frames: the Solver's own, and with all that the curriculum "
-        "spent. Evaluations: of levels, asked for by the curriculum. P(better): that a run of the "
-        f"method has the higher {first.name}. {INTERVALS}"
+        f"spent. Evaluations: of levels, asked for by the curriculum. {INTERVALS}"
     )
-    return Table("methods", "Methods", note, rows, [tenth])
+    return Table("methods", "Methods", note, rows, [tenth, f"P(better than {baseline.label})"])
 
 
 def run_table(study: Study) -> Table:
@@ -167,28 +285,35 @@ def run_table(study: Study) -> Table:
     return Table("runs", "Runs", "Measurements are the run's last.", rows)
 
 
-def answer(study: Study) -> tuple[str, str]:
-    """Returns two sentences: the best method with its test, and the others against the baseline."""
-    outcome, baseline = primary(study), study.baseline
-    ranked = sorted(study.compared, key=lambda group: -np.mean(outcome.values(group)))
-    best, *others = ranked
-    median = write(outcome.median(best))
-    if not others:
+def answer(study: Study) -> list[str]:
+    """Returns what a reader needs first: a method beside the baseline, and where the rest stands.
+
+    The method is the first planned one, or the one with the highest mean.
+    """
+    outcome, baseline, rows = primary(study), study.baseline, first_rows(study)
+    ranked = [row for row in rows if row.asked]
+    best = ranked[0].label
+    mean = write(float(np.mean(outcome.values(study.group(best) or baseline))))
+    if len(ranked) == 1:
         alone = "here" if len(study.groups) == 1 else f"with runs of {study.horizon} updates"
-        return (
-            f"{best.label} is the only method {alone} ({outcome.name}: {median}, median over "
-            "seeds).",
+        return [
+            f"{best} is the only method {alone} ({outcome.name}: {mean}, mean over seeds).",
             "Nothing is compared, so this page does not show whether that is good.",
-        )
-    found = decisions(study)
-    # By the mean, as in the tests: by the median another could be significantly better.
-    first = (
-        f"Of {len(ranked)} methods, {best.label} has the highest {outcome.name} and over seeds "
-        f"(median over seeds: {median}); "
-        f"{_shown(best, {other.label: found[best.label, other.label] for other in others})}."
+        ]
+    others = [row for row in ranked if row.decision]
+    first = next(
+        (row for label in study.planned for row in others if row.label == label), others[0]
     )
-    rest = [group.label for group in ranked if group is not baseline]
-    return first, _against(baseline, {label: found[baseline.label, label] for label in rest})
+    found = {row.label: row.decision for row in others if row.decision}
+    sentences = [first.sentence, _against(baseline, found)]
+    if len(others) > 1:
+        pairs = decisions(study)
+        rest = {row.label: pairs[best, row.label] for row in ranked if row.label != best}
+        sentences.append(
+            f"Of {len(ranked)} methods, {best} has the highest mean over seeds ({mean}); "
+            f"{_shown(best, rest)}."
+        )
+    return sentences
 
 
 def meaning(group: Group, meanings: Meanings) -> str:
@@ -204,9 +329,9 @@ def meaning(group: Group, meanings: Meanings) -> str:
     return f"{text} ({group.setting})" if group.setting else text
 
 
-def _shown(best: Group, found: Mapping[str, Decision]) -> str:
+def _shown(best: str, found: Mapping[str, Decision]) -> str:
     """Returns a clause on how many other methods the best one beats significantly."""
-    beaten = [decision.winner == best.label for decision in found.values()]
+    beaten = [decision.winner == best for decision in found.values()]
     if all(decision.verdict == TOO_FEW for decision in found.values()):
         return f"but it takes {FEWEST} seeds of each to decide whether that is more than chance"
     if all(beaten):
@@ -215,7 +340,7 @@ def _shown(best: Group, found: Mapping[str, Decision]) -> str:
         return "but it is not shown to have learnt"
     if not any(beaten):
         return "but there is no significant difference to any of the others"
-    left = [label for label, decision in found.items() if decision.winner != best.label]
+    left = [label for label, decision in found.items() if decision.winner != best]
     return (
         f"it is significantly better than {sum(beaten)} of the {len(found)} others, with no "
         f"significant difference to {_listed(left)}"
@@ -225,7 +350,8 @@ def _shown(best: Group, found: Mapping[str, Decision]) -> str:
 def _against(baseline: Group, found: Mapping[str, Decision]) -> str:
     """Returns a sentence on how the other methods compare to the baseline."""
     if all(decision.verdict == TOO_FEW for decision in found.values()):
-        return f"Too few seeds for a comparison with the baseline, {baseline.label}."
+        few = f"Too few seeds for a comparison with the baseline, {baseline.label}"
+        return f"{few}: it takes {FEWEST} of each."
     better = [label for label, decision in found.items() if decision.winner == label]
     worse = [label for label, decision in found.items() if decision.winner == baseline.label]
     unlearnt = sum(decision.verdict == NOT_LEARNT for decision in found.values())

@@ -19,6 +19,9 @@
   });
   const draw = (place, traces, shape) => window.Plotly.react(place, traces, layout(shape), OPTIONS);
 
+  // Okabe's and Ito's colours, for what is chosen; what is not is grey, the baseline dark.
+  const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"], GREY = "#cfd4d9", DARK = "#1b1f24";
+
   // What was packed into the page, as text: gzip in base64.
   const unpack = async (element) => {
     const bytes = Uint8Array.from(atob(element.textContent), (c) => c.charCodeAt(0));
@@ -40,55 +43,53 @@
     }
     return { x, y };
   };
-  const curveTraces = (data, measure, along, methods, seeds) => {
-    const bands = [], lines = [], single = [];
+  const curveTraces = (data, measure, along, colours, seeds) => {
+    const grey = [], bands = [], lines = [], single = [];
     data.methods.forEach((method, m) => {
-      const series = measure.axes[along][m];
-      if (!series || !methods.has(m)) return;
+      const series = measure.axes[along][m], color = colours.get(m);
+      if (!series) return;
       const name = plain(method.label);
-      const look = { type: "scatter", mode: series.x.length < 3 ? "lines+markers" : "lines", name };
-      const line = { color: method.colour, dash: method.dash, width: 2.2 };
-      bands.push({ ...look, ...bandOf(series), mode: "lines", fill: "toself", fillcolor: method.colour,
-        line: { width: 0 }, opacity: 0.13, hoverinfo: "skip", meta: "band" });
+      const look = { type: "scatter", mode: series.x.length < 3 ? "lines+markers" : "lines", name, showlegend: false };
+      const line = { color: color ?? GREY, width: color ? 2.4 : 1 };
       const text = series.median.map((median, i) => (series.low[i] === null ? short(median)
         : `${short(median)} [${short(series.low[i])}, ${short(series.high[i])}]`));
       const hover = { text, hovertemplate: `<b>${name}</b><br>%{text}<br>at %{x:,.4~g}<extra></extra>` };
+      if (!color) return grey.push({ ...look, x: series.x, y: series.median, line, ...hover, meta: "rest" });
+      bands.push({ ...look, ...bandOf(series), mode: "lines", fill: "toself", fillcolor: color,
+        line: { width: 0 }, opacity: 0.13, hoverinfo: "skip", meta: "band" });
       const whole = (median, i) => (series.whole[i] ? median : null);
       if (!series.whole.every(Boolean))
         lines.push({ ...look, x: series.x, y: series.median, line: { ...line, width: 0.8 }, ...hover });
-      lines.push({ ...look, x: series.x, y: series.median.map(whole), line, ...hover, meta: "median" });
+      lines.push({ ...look, x: series.x, y: series.median.map(whole), line, ...hover, meta: "median", showlegend: true });
       series.rows.forEach((row, r) => {
         if (!seeds.has(series.seeds[r])) return;
         single.push({ ...look, x: series.x, y: row, connectgaps: true, line: { ...line, width: 1 }, opacity: 0.7, meta: "seed",
           hovertemplate: `<b>${name}</b>, seed ${series.seeds[r]}<br>%{y:.4~g} at %{x:,.4~g}<extra></extra>` });
       });
     });
-    return [...bands, ...single, ...lines];
+    return [...grey, ...bands, ...single, ...lines];
   };
-  const drawCurves = (place, data, measure, along, methods, seeds) => {
-    const rate = measure.rate ? { range: [-0.02, 1.02] } : {};
-    const log = measure.log ? { type: "log", tickformat: ".0%", dtick: 0.5 } : {};
-    return draw(place, curveTraces(data, measure, along, methods, seeds),
-      { height: 470, xaxis: axis(along, log), yaxis: axis(measure.name, rate), uirevision: measure.name + along });
+  const drawCurves = (place, data, measure, along, colours, seeds) => {
+    // As far as the coloured methods go: one that costs nine times as much would squeeze the others.
+    const ends = [...colours.keys()].flatMap((m) => measure.axes[along][m]?.x.slice(-1) ?? []);
+    const shape = measure.log ? { type: "log", tickformat: ".0%", dtick: 0.5 } : ends.length ? { range: [0, Math.max(...ends)] } : {};
+    return draw(place, curveTraces(data, measure, along, colours, seeds), { height: 470, showlegend: true, legend: { orientation: "h", y: 1.02, yanchor: "bottom" },
+      xaxis: axis(along, shape), yaxis: axis(measure.name, measure.rate ? { rangemode: "tozero" } : {}), uirevision: measure.name + along });
   };
 
-  // ---- Outcomes: the methods in their order, with intervals and a dot for each seed.
-  const drawOutcomes = (place, data, outcome, methods) => {
-    const rank = (m) => (outcome.methods[m].estimate.length ? outcome.sign * outcome.methods[m].estimate[0] : -Infinity);
-    const order = data.methods.map((_, m) => m).filter((m) => methods.has(m)).sort((a, b) => rank(a) - rank(b));
+  // ---- Outcomes: the methods in the order of their means, with a dot for each seed.
+  const drawOutcomes = (place, data, outcome, colours) => {
+    const rank = (m) => (outcome.methods[m].mean.length ? outcome.sign * outcome.methods[m].mean[0] : -Infinity);
+    const order = data.methods.map((_, m) => m).sort((a, b) => rank(a) - rank(b));
     const traces = [];
     order.forEach((m, y) => {
-      const { estimate, values } = outcome.methods[m], { label, colour, seeds } = data.methods[m];
+      const { mean, values } = outcome.methods[m], { label, seeds } = data.methods[m], color = colours.get(m) ?? "#8c959f";
       const name = plain(label), spread = values.map((_, i) => y - 0.2 + (0.4 * (i + 0.5)) / values.length);
       traces.push({ type: "scatter", mode: "markers", x: values, y: spread, text: seeds.map((s) => `seed ${s}`),
-        marker: { color: colour, size: 6, opacity: 0.35 }, hovertemplate: `<b>${name}</b>, %{text}<br>%{x:.4~g}<extra></extra>` });
-      if (!estimate.length) return;
-      const [median, low, high] = estimate, known = low !== null;
-      traces.push({ type: "scatter", mode: "markers", x: [median], y: [y], name, meta: "estimate",
-        marker: { color: colour, size: 11, symbol: "diamond" },
-        error_x: { type: "data", symmetric: false, array: [known ? high - median : 0], arrayminus: [known ? median - low : 0],
-          color: colour, thickness: 2.5, width: 5, visible: known },
-        hovertemplate: `<b>${name}</b><br>${short(median)}${known ? ` [${short(low)}, ${short(high)}]` : ""}<extra></extra>` });
+        marker: { color, size: 6, opacity: 0.35 }, hovertemplate: `<b>${name}</b>, %{text}<br>%{x:.4~g}<extra></extra>` });
+      if (!mean.length) return;
+      traces.push({ type: "scatter", mode: "markers", x: mean, y: [y], name, meta: "mean",
+        marker: { color, size: 11, symbol: "diamond" }, hovertemplate: `<b>${name}</b><br>%{x:.4~g}<extra></extra>` });
     });
     const labels = order.map((m) => plain(data.methods[m].label));
     return draw(place, traces, { height: 90 + 27 * order.length, xaxis: axis(outcome.name),
@@ -106,7 +107,7 @@
     return draw(place, [
       { type: "scatter", mode: "lines", x: ends, y: ends, line: { color: "#8c959f", width: 1 }, hoverinfo: "skip" },
       { type: "scatter", mode: "markers", x, y, meta: "levels", text: x.map((_, i) => `number ${i}`),
-        marker: { color: data.methods[up].colour, size: 7, opacity: 0.4 },
+        marker: { color: COLOURS[0], size: 7, opacity: 0.4 },
         hovertemplate: `<b>%{text}</b><br>${plain(top)}: %{y:.4~g}<br>${plain(right)}: %{x:.4~g}<extra></extra>` },
     ], { height: 520, xaxis: axis(`${measure.name}, ${right}`), yaxis: axis(`${measure.name}, ${top}`) });
   };
@@ -125,8 +126,8 @@
       return make("pre", { title: name }, level.join("\n"));
     }));
     draw(parts.success, [
-      { type: "scatter", mode: "lines", x, y, line: { color: parts.colour, width: 2 }, hovertemplate: "%{y:.4~g} at update %{x}<extra></extra>" },
-      { type: "scatter", mode: "markers", x: [stage.updates], y: [reached], marker: { color: parts.colour, size: 12 }, hoverinfo: "skip", meta: "now" },
+      { type: "scatter", mode: "lines", x, y, line: { color: COLOURS[0], width: 2 }, hovertemplate: "%{y:.4~g} at update %{x}<extra></extra>" },
+      { type: "scatter", mode: "markers", x: [stage.updates], y: [reached], marker: { color: COLOURS[0], size: 12 }, hoverinfo: "skip", meta: "now" },
     ], { height: 300, xaxis: axis(data.axes[0]), yaxis: axis(data.headline.name, data.headline.rate ? { range: [-0.02, 1.02] } : {}),
       shapes: [{ type: "line", x0: stage.updates, x1: stage.updates, yref: "paper", y0: 0, y1: 1, line: { color: "#8c959f", dash: "dot", width: 1 } }] });
     const maps = found.stages.map((each) => each.map).filter(Boolean);
@@ -142,6 +143,45 @@
     { height: 300, xaxis: axis(columns.name, ticks(columns)), yaxis: axis(rows ? rows.name : "", ticks(rows)) });
   };
 
+  // ---- Methods beside the baseline: what is ticked is compared, and p is corrected for that alone.
+  const ERROR = 0.05;
+  const holm = (every) => {
+    const order = every.map((_, i) => i).sort((a, b) => every[a] - every[b]), found = [];
+    order.forEach((i, rank) => { found[i] = Math.max(found[order[rank - 1]] ?? 0, Math.min(1, every[i] * (every.length - rank))); });
+    return found;
+  };
+  const written = (p) => (p < 0.001 ? "< 0.001" : String(Number(p.toPrecision(2))));
+  const against = (table) => {
+    const rows = [...table.tBodies[0].rows], verdict = 3;
+    const answer = table.closest("section").querySelector(".answer"), whole = [...answer.children];
+    const chosen = () => rows.filter((row) => row.querySelector("input")?.checked);
+    const tell = () => {
+      const own = chosen(), asked = own.length ? own : rows, tested = asked.filter((row) => row.dataset.alone);
+      const corrected = holm(tested.map((row) => Number(row.dataset.alone)));
+      for (const row of rows) {
+        const p = corrected[tested.indexOf(row)], { kind, alone } = row.dataset;
+        row.dataset.now = p <= ERROR ? kind : "";
+        row.cells[verdict].textContent = !asked.includes(row) || !kind ? "–" : p === undefined ? kind
+          : p > ERROR && alone <= ERROR ? `undecided: p ${written(p)} in ${tested.length} tests, ${written(Number(alone))} alone`
+            : `${p > ERROR ? "undecided" : kind}, p ${written(p)}`;
+      }
+      const said = own.map((row) => make("p", {}, `${row.dataset.says}, ${row.cells[verdict].textContent}.`));
+      answer.replaceChildren(...(said.length ? said.slice(0, 3) : whole));
+    };
+    // The methods in colour, by their numbers: the baseline, and what is ticked or else the first.
+    const colours = () => {
+      const own = chosen(), shown = own.length ? own : rows.filter((row) => row.dataset.kind).slice(0, 1);
+      const found = new Map(shown.map((row, i) => [row, COLOURS[i % COLOURS.length]]));
+      for (const row of rows) {
+        if (!row.dataset.kind) found.set(row, DARK);
+        row.querySelector("i").style.background = found.get(row) ?? "none";
+      }
+      return new Map([...found].map(([row, colour]) => [Number(row.dataset.number), colour]));
+    };
+    table.addEventListener("change", tell);
+    return colours;
+  };
+
   // ---- One study: its controls and charts.
   const checked = (boxes) => new Set(boxes.filter((box) => box.checked).map((box) => Number(box.value)));
   const study = async (section) => {
@@ -155,6 +195,7 @@
     one("measure").append(...kinds.map((kind) => make("optgroup", { label: kind },
       ...data.measures.flatMap((measure, i) => (measure.kind === kind ? [option(measure.name, i)] : [])))));
     one("outcome").append(...data.outcomes.map((outcome, i) => option(outcome.name, i)));
+    const table = section.querySelector(".against"), colours = against(table);
     let along = data.axes[0];
     const redraw = () => {
       const measure = data.measures[Number(one("measure").value)], possible = Object.keys(measure.axes);
@@ -165,16 +206,15 @@
         button.addEventListener("click", () => { along = name; redraw(); });
         return button;
       }));
-      drawCurves(one("curves"), data, measure, shown, checked(boxes("methods")), checked(boxes("seeds")));
-      drawOutcomes(one("outcomes"), data, data.outcomes[Number(one("outcome").value)], checked(boxes("methods")));
+      drawCurves(one("curves"), data, measure, shown, colours(), checked(boxes("seeds")));
+      drawOutcomes(one("outcomes"), data, data.outcomes[Number(one("outcome").value)], colours());
     };
-    for (const name of ["methods", "seeds"])
-      one(name).addEventListener("click", (event) => {
-        if (!event.target.dataset.all) return;
-        boxes(name).forEach((box) => { box.checked = event.target.dataset.all === "1"; });
-        redraw();
-      });
-    for (const name of ["methods", "seeds", "measure", "outcome"]) one(name).addEventListener("change", redraw);
+    one("seeds").addEventListener("click", (event) => {
+      if (!event.target.dataset.all) return;
+      boxes("seeds").forEach((box) => { box.checked = event.target.dataset.all === "1"; });
+      redraw();
+    });
+    for (const each of [table, ...["seeds", "measure", "outcome"].map(one)]) each.addEventListener("change", redraw);
     redraw();
     if (one("single")) single(one, data, option);
     if (one("through")) through(one, data, option);
@@ -200,7 +240,7 @@
       const found = data.stages.methods[Number(choice.value)];
       range.max = found.stages.length - 1;
       const parts = Object.fromEntries(["moment", "levels", "success", "map"].map((name) => [name, one(name)]));
-      drawStage({ ...parts, mapPart: one("map-part"), noMap: one("no-map"), colour: data.methods[Number(choice.value)].colour },
+      drawStage({ ...parts, mapPart: one("map-part"), noMap: one("no-map") },
         data, found, Number(range.value));
       range.setAttribute("aria-valuetext", parts.moment.textContent);
     };
@@ -226,7 +266,7 @@
   };
   const sortable = (table) => {
     const heads = [...table.tHead.rows[0].cells], body = table.tBodies[0];
-    const text = (row, column) => row.cells[column].textContent;
+    const text = (row, column) => row.cells[column].dataset.value ?? row.cells[column].textContent;
     heads.forEach((head, column) => {
       const button = make("button", { type: "button" }, ...head.childNodes);
       head.replaceChildren(button);
@@ -239,7 +279,7 @@
           || (up ? 1 : -1) * compare(text(a, column), text(b, column))));
       });
     });
-    if (body.rows.length < 6) return;
+    if (body.rows.length < 6 || table.className === "against") return;
     const count = make("span", { className: "dim" }), field = make("input", { type: "search", placeholder: "Filter rows" });
     field.setAttribute("aria-label", "Filter rows");
     count.setAttribute("aria-live", "polite");
@@ -260,6 +300,7 @@
     const script = make("script", { textContent: await unpack(document.getElementById("plotly")) });
     document.head.append(script);
     document.documentElement.classList.add("live-page");
+    document.querySelectorAll("#arena .against").forEach((table) => against(table));
     for (const section of document.querySelectorAll("section.study")) await study(section);
     document.documentElement.dataset.ready = "1";
   };

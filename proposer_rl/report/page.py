@@ -7,6 +7,7 @@ import gzip
 import hashlib
 import io
 import json
+import math
 import shlex
 from collections.abc import Iterable, Sequence
 from functools import cache
@@ -18,15 +19,26 @@ from jinja2 import Environment, StrictUndefined
 from PIL import Image
 
 from proposer_rl.report import arena
-from proposer_rl.report.outcomes import Meanings, against_baseline, answer, group_table, meaning
+from proposer_rl.report.outcomes import (
+    Meanings,
+    Row,
+    about_rows,
+    answer,
+    first_rows,
+    first_table,
+    group_table,
+    meaning,
+)
 from proposer_rl.report.runs import COST, Run
+from proposer_rl.report.statistics import ERROR
 from proposer_rl.report.studies import Study
-from proposer_rl.report.style import DASHES, DPI, Drawing, in_few_colours
-from proposer_rl.report.tables import Table, escape_markdown
+from proposer_rl.report.style import DPI, Drawing, in_few_colours
+from proposer_rl.report.tables import Table, escape_markdown, write
 from proposer_rl.runs.records import anywhere, level_text, words
 
 PIXELS = 78  # of an inch of a figure
-MARKS = {"": "", "o": "●", "s": "■", "^": "▲", "D": "◆", "v": "▼", "P": "✚", "X": "✖"}
+WIDE = 170  # pixels of the dots of the first table
+APART = 35  # pixels between two numbers of their scale
 
 
 Section = dict[str, Any]  # all that the page shows of a study, as the template names it
@@ -78,18 +90,66 @@ def figure(drawing: Drawing, png: bytes) -> Section:
     }
 
 
-def methods(study: Study, meanings: Meanings) -> list[Section]:
-    """Returns the methods with their looks and what they do, in the order of the charts."""
-    return [
-        {
-            "label": group.label,
-            "meaning": meaning(group, meanings),
-            "colour": group.look.colour,
-            "dash": DASHES[group.look.dash],
-            "mark": MARKS[group.look.mark],
-        }
-        for group in study.groups
-    ]
+def methods(study: Study, meanings: Meanings) -> list[tuple[str, str]]:
+    """Returns the methods and what they do."""
+    return [(group.label, meaning(group, meanings)) for group in study.groups]
+
+
+def first(
+    table: Table, rows: Sequence[Row], labels: Sequence[str], planned: Sequence[str]
+) -> Section:
+    """Returns the first table of a page: each method beside the baseline, with its dot.
+
+    Args:
+        table: of these rows.
+        rows: as :func:`proposer_rl.report.outcomes.first_rows` returns them.
+        labels: of the methods in the order of the charts.
+        planned: labels that are ticked.
+    """
+    ends = [0.0, *(end for row in rows for end in row.difference if end == end)]
+    low, high = min(ends), max(ends)
+    scale = (WIDE - 12) / ((high - low) or 1.0)
+
+    def place(value: float) -> float:
+        return round(6 + scale * (value - low), 1)
+
+    found = []
+    for row, texts in zip(rows, table.texts(), strict=True):
+        value, *interval = map(place, row.difference)
+        decision = row.decision
+        alone = None if decision is None or math.isnan(decision.alone) else decision.alone
+        now = decision is not None and row.asked and decision.p <= ERROR
+        kind = decision and (decision.told if alone is None else decision.kind)(row.label)
+        found.append(
+            {
+                "texts": texts,
+                "value": row.difference.estimate,
+                "dot": decision and value,
+                "interval": None if alone is None else interval,
+                "alone": alone,
+                "kind": kind,
+                "now": kind if now else "",
+                "says": row.says,
+                "number": labels.index(row.label) if row.label in labels else None,
+                "ticked": row.label in planned,
+            }
+        )
+    zero = place(0.0)
+    ticks = [(x, write(end)) for end in (low, high) if abs((x := place(end)) - zero) > APART]
+    ticks.append((zero, "0"))
+    return {"table": table, "rows": found, "wide": WIDE, "ticks": ticks, "zero": zero}
+
+
+def first_of_study(study: Study) -> Table:
+    """Returns the first table of a study."""
+    shown = f"updates to {level_text(study.headline, study.threshold)}"
+    return first_table(first_rows(study), study.baseline.label, shown, about_rows(study))
+
+
+def first_of_tasks(compared: arena.Arena) -> Table:
+    """Returns the first table over several tasks."""
+    about, baseline = arena.about_rows(compared), compared.baselines[0]
+    return first_table(compared.rows, baseline, "worst task", about, "arena_baseline")
 
 
 def facts(study: Study) -> list[tuple[str, str]]:
@@ -170,10 +230,12 @@ def report_command(
     threshold: float | None,
     baselines: Sequence[str],
     *more: str,
+    compare: Sequence[str] = (),
 ) -> str:
     """Returns the command that writes this report again, from the same folder."""
     asked = [] if threshold is None else [f"--threshold={threshold:g}"]
     asked += [f"--baseline={baseline}" for baseline in baselines]
+    asked += [f"--compare={','.join(compare)}"] if compare else []
     return f"{program} {shlex.join([*map(str, folders), *asked, *more])}"
 
 
@@ -217,21 +279,24 @@ def _distinct(runs: Sequence[Run], text: Any) -> str:
 
 
 def section(study: Study, figures: str) -> str:
-    """Returns a study's part of a Markdown page: facts, the answer and the tables."""
+    """Returns a study's part of a Markdown page: the answer, the tables, what was run."""
     about = facts(study) + origin(study)
     if short := incomplete(study):
         text = f"Not finished, or shorter than {study.horizon} updates"
         about = [*about, (text, ", ".join(short))]
-    tables = group_table(study), against_baseline(study)
-    parts = [
-        f"## {escape_markdown(study.title)}",
-        escape_markdown(" ".join(answer(study))),
-        "\n".join(f"- {escape_markdown(f'{name}: {text}')}" for name, text in about),
-        f"![Learning curves and updates to the threshold]({figures}learning_curves.png)",
-    ]
-    parts += _tables(tables)
     made = "\n".join(commands(study))
-    return "\n\n".join([*parts, "### Commands", f"```bash\n{made}\n```"])
+    return "\n\n".join(
+        [
+            f"## {escape_markdown(study.title)}",
+            "\n".join(f"- {escape_markdown(sentence)}" for sentence in answer(study)),
+            *_tables([first_of_study(study)]),
+            f"![Learning curves and updates to the threshold]({figures}learning_curves.png)",
+            *_tables([group_table(study)]),
+            "### Runs and commands",
+            "\n".join(f"- {escape_markdown(f'{name}: {text}')}" for name, text in about),
+            f"```bash\n{made}\n```",
+        ]
+    )
 
 
 def over_tasks(compared: arena.Arena, figures: str) -> str:
@@ -239,10 +304,9 @@ def over_tasks(compared: arena.Arena, figures: str) -> str:
     drawing = arena.differences(compared)
     summary, by_task = arena.summary(compared), arena.task_table(compared)
     picture = f"![{escape_markdown(drawing.title)}]({figures}{drawing.name}.png)"
-    said = escape_markdown(" ".join(arena.answer(compared)))
-    return "\n\n".join(
-        ["## Over all tasks", said, *_tables([summary]), picture, *_tables([by_task])]
-    )
+    said = "\n".join(f"- {escape_markdown(sentence)}" for sentence in arena.answer(compared))
+    first = _tables([first_of_tasks(compared), summary])
+    return "\n\n".join(["## Over all tasks", said, *first, picture, *_tables([by_task])])
 
 
 def of_teachers(drawings: Sequence[Drawing], notes: Sequence[str], figures: str) -> str:
@@ -255,8 +319,8 @@ def _tables(tables: Iterable[Table]) -> list[str]:
     parts = []
     for table in tables:
         if table.rows:
-            parts += [f"### {escape_markdown(table.title)}", escape_markdown(table.note)]
-            parts.append(table.to_markdown().strip())
+            text = table.to_markdown().strip()
+            parts += [f"### {escape_markdown(table.title)}", text, escape_markdown(table.note)]
     return parts
 
 

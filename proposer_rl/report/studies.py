@@ -71,6 +71,7 @@ class Study:
         groups: what is compared, by label.
         threshold: of the headline measurement.
         chosen: the label of the baseline that was asked for.
+        planned: labels of the methods that are compared; of none all are.
         timed: the machine on which all methods were timed in turns; None where seconds are what the
             runs took.
     """
@@ -79,6 +80,7 @@ class Study:
     groups: tuple[Group, ...]
     threshold: float
     chosen: str | None = None
+    planned: tuple[str, ...] = ()
     timed: str | None = None
 
     @property
@@ -126,8 +128,19 @@ class Study:
 
     @property
     def baseline(self) -> Group:
-        """The group that others are compared with: the chosen one, the usual one, or the first."""
-        return self.group(self.chosen or "") or self.group(USUAL_BASELINE) or self.compared[0]
+        """The group that others are compared with: the chosen one, the usual one, or the first.
+
+        Of planned methods without the usual one it is the last.
+        """
+        usual = USUAL_BASELINE if USUAL_BASELINE in (self.planned or [USUAL_BASELINE]) else ""
+        found = map(self.group, [self.chosen or "", usual, *reversed(self.planned)])
+        return next(filter(None, found), self.compared[0])
+
+    @property
+    def asked(self) -> list[Group]:
+        """The groups that are tested against each other: the planned ones and the baseline."""
+        labels = {*self.planned, self.baseline.label}
+        return [group for group in self.compared if not self.planned or group.label in labels]
 
     def scores(self, group: Group, name: str) -> Column | None:
         """Returns what runs of full length reach on each level, [runs, levels]; None without."""
@@ -149,7 +162,10 @@ class Study:
 
 
 def read_studies(
-    folders: Iterable[Path], threshold: float | None, baseline: str | None = None
+    folders: Iterable[Path],
+    threshold: float | None,
+    baseline: str | None = None,
+    planned: Sequence[str] = (),
 ) -> tuple[list[Study], list[str]]:
     """Reads runs and sorts them into studies.
 
@@ -179,6 +195,7 @@ def read_studies(
             tuple(replace(group, look=every[group.label]) for group in groups),
             float(example.config["schedule"]["threshold"]) if threshold is None else threshold,
             baseline,
+            tuple(planned),
         )
         for example, groups in grouped
     ]

@@ -72,10 +72,25 @@ def test_the_worst_case_and_the_mean_are_to_the_better_baseline_of_each_task(run
     assert target[lead] == pytest.approx((0.25, 0.25 - whole, 0.25 + whole), abs=1e-6)
     small, large = (2 * stats.t.sf(mean / ERROR * np.sqrt(2), 8) for mean in (0.25, 0.1))
     assert (target["p (Holm)"], uniform["p (Holm)"]) == pytest.approx((2 * small, large))
-    first, second = answer(compared)
+    lead, first, second = answer(compared)
     best = "plr has the best worst case: a difference of −0.100 [−0.198, −0.002]"
     assert first.startswith(f"Of 3 methods on 2 tasks, {best} to the better of domain_random")
     assert second == "In the mean over tasks it is significantly better than 2 of the 2 others."
+
+
+def test_each_method_is_beside_the_baseline_in_the_mean_over_tasks(runs: Path) -> None:
+    compared = found(runs)
+    assert compared is not None
+    plr, uniform, target = compared.rows
+    assert [row.label for row in compared.rows] == ["plr", "domain_randomization", "target"]
+    whole = ERROR / np.sqrt(2) * OF_EIGHT  # of the mean of two tasks, each of five pairs
+    assert plr.difference == pytest.approx((0.1, 0.1 - whole, 0.1 + whole), abs=1e-6)
+    p = 2 * stats.t.sf(0.1 / ERROR * np.sqrt(2), 8)
+    assert plr.decision is not None and plr.decision.p == pytest.approx(p)
+    # Without any spread nothing is tested, so that it does not count.
+    assert target.difference.estimate == pytest.approx(-0.15) and target.verdict != "–"
+    assert (plr.frames, plr.seconds) == (1, 1) and uniform.decision is None
+    assert plr.reached == "−0.100 arena/b"
 
 
 def test_every_task_has_the_differences_to_each_baseline(runs: Path) -> None:
@@ -107,6 +122,14 @@ def test_other_baselines_are_other_tasks(runs: Path, tmp_path: Path) -> None:
     assert leader["lowest end"] is None and np.isnan(leader["mean over tasks"].low)
     write_task(tmp_path, "a", MEANS["a"])
     assert found(tmp_path) is None
+
+
+def test_one_usual_baseline_is_enough(tmp_path: Path) -> None:
+    for name in MEANS:
+        write_task(tmp_path, name, {"target": 0.5, "plr": 0.6 + SPREAD})
+    compared = found(tmp_path)
+    assert compared is not None and compared.baselines == ("target",)
+    assert [row.label for row in compared.rows] == ["plr", "target"]
 
 
 @pytest.mark.usefixtures("undrawn")

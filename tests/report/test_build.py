@@ -166,6 +166,7 @@ def test_a_report_is_replaced_and_nothing_else(
         (["runs", "--threshold=nan"], "must be a number, got 'nan'"),
         (["runs", "--threshold=80"], "must be above 0 and at most 1"),
         (["runs", "--baseline=nobody"], "--baseline=nobody: must be one of target"),
+        (["runs", "--compare=target,nobody"], "--compare=nobody: must be one of target"),
     ],
 )
 def test_what_cannot_be_reported_gets_one_line_and_leaves_all_as_it_was(
@@ -230,6 +231,25 @@ def test_the_baseline_can_be_chosen_among_the_methods(tmp_path: Path) -> None:
         other = {"plr": "target", "target": "plr"}[baseline]
         assert found == {baseline: "", other: "0.5"}
     assert "--baseline=target" in (output / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_planned_comparisons_are_named_by_labels(tmp_path: Path) -> None:
+    """Those of ablations have a comma in them."""
+    for place, method in enumerate(("target", "plr", "sfl")):
+        for seed in range(5):
+            folder = tmp_path / "runs" / f"{method}{seed}"
+            curve = [0, 0.3 + 0.02 * seed * place + 0.1 * place]
+            write_run(folder, method, [seed], curve, ablation="less" if place == 1 else "none")
+    asked = "--compare=plr, less,target"
+    main([str(tmp_path / "runs"), "-q", "-o", str(tmp_path / "report"), asked])
+    file = tmp_path / "report" / "tables" / "baseline.csv"
+    rows = {row["method"]: row for row in csv.DictReader(file.open(encoding="utf-8"))}
+    assert list(rows) == ["sfl", "plr, less", "target (baseline)"]
+    assert rows["plr, less"]["p (Holm)"] == rows["plr, less"]["p"] != ""
+    assert rows["sfl"]["p (Holm)"] == "" and rows["sfl"]["verdict"] == "–"
+    page = Tags((tmp_path / "report" / "report.html").read_text(encoding="utf-8")).text
+    assert "'--compare=plr, less,target'" in page
 
 
 DEEP: list[Any] = []

@@ -128,7 +128,8 @@ def test_the_group_table_has_the_numbers(tmp_path: Path) -> None:
     assert worst.estimate == pytest.approx(np.median(curve_last(SLOW)) / 2)
     # What nobody decides by is for who reads the CSV.
     assert "worst 10 %" in table.to_csv() and "worst" not in table.to_markdown()
-    assert len(table.columns) == len(table.texts()[0]) == len(table.rows[0]) - 1
+    assert "P(better" in table.to_csv() and "P(better" not in table.to_markdown()
+    assert len(table.columns) == len(table.texts()[0]) == len(table.rows[0]) - 2
     assert rows["perf_gain"]["evaluations"] == 150
     assert rows["perf_gain"]["with the curriculum's (M)"] == pytest.approx(50 * 700 / 1e6)
 

@@ -28,7 +28,7 @@ pytestmark = needs_chromium
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     runs = tmp_path_factory.mktemp("runs")
     other = {"picture": png(255 - PIXELS)}
     for seed in range(SEEDS):
@@ -42,9 +42,14 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ]
         write_jsonl(folder / "curriculum.jsonl", lines)
         for number, method in enumerate((HOSTILE, "target")):
-            curve = [0.0, 0.1, 0.2, 0.1 * number + 0.3 + seed / 100]
+            curve = [0.0, 0.1, 0.2, 0.1 * number + 0.3 + (3 + 5 * number) * seed / 400]
             reached = [0.1 * number, 0.5, 0.9 - 0.2 * number + seed / 100]
             write_run(runs / f"{number}{seed}", method, [seed], curve, levels=reached)
+    return runs
+
+
+@pytest.fixture(scope="module")
+def written(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(build, "DRAWINGS", [cost_curves])
         return write_report([runs], tmp_path_factory.mktemp("out") / "report", progress=False)
@@ -87,22 +92,50 @@ def seen(written: Path) -> Iterator[Seen]:
         yield seen
 
 
-def test_methods_are_switched_on_and_off(seen: Seen) -> None:
-    assert len(seen.traces(".curves", "median")) == 3
-    assert len(seen.traces(".curves", "band")) == 3
-    seen.tick(".methods", "target")
-    for chart, kind in ((".curves", "median"), (".curves", "band"), (".outcomes", "estimate")):
-        names = [trace["name"] for trace in seen.traces(chart, kind)]
-        assert len(names) == 2 and "perf_gain" in names and "target" not in names
-    seen.page.locator(".methods button", has_text="all").click()
-    assert len(seen.traces(".curves", "median")) == 3
+def verdicts(page: Any) -> dict[str, str]:
+    rows = page.locator(".against tbody tr").all()
+    return {
+        row.locator("label").inner_text(): row.locator("td").nth(3).inner_text() for row in rows
+    }
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_what_is_ticked_is_compared_alone_and_in_colour(
+    seen: Seen, runs: Path, tmp_path: Path
+) -> None:
+    """As ``--compare`` compares it."""
+    whole, answer = verdicts(seen.page), seen.page.locator(".answer").inner_text()
+    assert list(whole) == ["perf_gain", "target", f"{HOSTILE} (baseline)"]
+    assert [*whole.values()][2] == "–" and whole["perf_gain"] == "better, p < 0.001"
+    coloured = {trace["name"] for trace in seen.traces(".curves", "median")}
+    assert len(coloured) == 2 and "perf_gain" in coloured  # the first, and the baseline
+    assert [trace["name"] for trace in seen.traces(".curves", "rest")] == ["target"]
+    assert {trace["name"] for trace in seen.traces(".curves", "band")} == coloured
+    seen.tick(".against", "target")
+    assert [trace["name"] for trace in seen.traces(".curves", "rest")] == ["perf_gain"]
+    planned = write_report([runs], tmp_path, progress=False, compare=["target", HOSTILE])
+    page = seen.page.context.new_page()
+    page.goto(planned.as_uri())
+    page.wait_for_selector("html[data-ready]")
+    assert verdicts(page) == verdicts(seen.page)
+    assert verdicts(page)["perf_gain"] == "–" and verdicts(page)["target"] != "–"
+    said = page.locator(".answer p").first.inner_text()
+    assert seen.page.locator(".answer").inner_text() == said and said != answer
+    page.close()
+    seen.tick(".against", "target")
+    assert verdicts(seen.page) == whole and seen.page.locator(".answer").inner_text() == answer
+
+
+def test_the_answer_fits_the_first_screen(seen: Seen) -> None:
+    box, view = seen.page.locator(".against").bounding_box(), seen.page.viewport_size
+    assert box["x"] + box["width"] <= view["width"] and box["y"] + box["height"] <= view["height"]
 
 
 def test_single_seeds_are_switched_on_and_off(seen: Seen) -> None:
     assert not seen.traces(".curves", "seed")
     seen.tick(".seeds", "4")
     rows = {trace["name"]: trace["y"] for trace in seen.traces(".curves", "seed")}
-    assert rows["perf_gain"] == [0, 0.3, 0.6, 0.84] and len(rows) == 3
+    assert rows["perf_gain"] == [0, 0.3, 0.6, 0.84] and len(rows) == 2
     seen.tick(".seeds", "4")
     assert not seen.traces(".curves", "seed")
 
@@ -125,8 +158,6 @@ def test_the_axis_and_the_measure_are_chosen(seen: Seen) -> None:
 
 
 def test_values_are_told_where_the_pointer_is(seen: Seen) -> None:
-    seen.page.locator(".methods button", has_text="none").click()
-    seen.tick(".methods", "perf_gain")
     seen.page.locator(".curves").scroll_into_view_if_needed()
     left, top = seen.page.evaluate(PIXEL, [".curves", 30, 0.825])
     for steps in range(3):
@@ -134,7 +165,6 @@ def test_values_are_told_where_the_pointer_is(seen: Seen) -> None:
     seen.page.wait_for_selector(".curves .hoverlayer .hovertext")
     text = seen.page.locator(".curves .hoverlayer").text_content()
     assert "perf_gain" in text and "0.825 [0.8, 0.85]" in text
-    seen.page.locator(".methods button", has_text="all").click()
 
 
 def test_two_methods_are_compared_level_by_level(seen: Seen) -> None:
@@ -185,12 +215,13 @@ def test_the_slider_moves_map_levels_and_success_together(seen: Seen) -> None:
 
 
 def test_tables_are_sorted_and_filtered(seen: Seen) -> None:
-    head = seen.page.locator("table").first.locator("th").nth(4)
-    for direction, turn in (("ascending", 1), ("descending", -1)):
-        head.locator("button").click()
-        assert head.get_attribute("aria-sort") == direction
-        values = [float(text.split()[0]) for text in seen.column(0, 5)]
-        assert len(values) == 3 and values == sorted(values)[::turn]
+    for table, number in ((0, 6), (1, 5)):  # frames, and the mean along training
+        head = seen.page.locator("table").nth(table).locator("th").nth(number - 1)
+        for direction, turn in (("ascending", 1), ("descending", -1)):
+            head.locator("button").click()
+            assert head.get_attribute("aria-sort") == direction
+            values = [float(text.split()[0]) for text in seen.column(table, number)]
+            assert len(values) == 3 and values == sorted(values)[::turn]
     runs = seen.page.locator("table").count() - 1
     seen.page.locator("details", has=seen.page.locator("table")).last.locator("summary").click()
     field = seen.page.locator("input[type=search]").last

@@ -91,7 +91,7 @@ def test_a_study_has_a_page_with_its_figures(runs: Path, tmp_path: Path) -> None
                                                                 "cycles", "levels")),
     }  # fmt: skip
     page = (light / "README.md").read_text(encoding="utf-8")
-    assert "| perf\\_gain | 5 |" in page and "perf\\_gain is better" in page
+    assert "| perf\\_gain | 5 |" in page and "| worse, p" in page
     for name in ("learning_curves", "proposals"):
         assert f"(figures/{name}.png)" in page and (light / f"figures/{name}.png").is_file()
     above, mark, below = page.partition(publish.MARK)
