@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -156,6 +157,8 @@ class RunConfig:
 
 def read_config(config: DictConfig) -> RunConfig:
     """Checks a composed configuration and returns it as settings."""
+    if isinstance(config.task, DictConfig) and "_target_" not in config.task:
+        located("task", {})  # before interpolations find less than what a task brings
     values = _resolved(config)
     for name, value in _leaves(values):
         if isinstance(value, int | float) and not abs(value) <= LARGEST:
@@ -171,6 +174,14 @@ def read_config(config: DictConfig) -> RunConfig:
         )
     if len(set(checked.seeds)) < len(checked.seeds):
         raise ConfigError(f"seeds={checked.seeds}: must be distinct")
+    until = checked.curriculum.get("until")
+    ends = [end for end in until if isinstance(end, int)] if isinstance(until, list) else []
+    if max(ends, default=0) >= checked.schedule.updates:
+        warnings.warn(
+            f"curriculum.until={until}: the last stage never begins, since the run ends after "
+            f"{checked.schedule.updates} updates",
+            stacklevel=2,
+        )
     return checked
 
 

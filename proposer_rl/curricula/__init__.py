@@ -12,8 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from proposer_rl.curricula.adaptive import AdaptiveMixture as AdaptiveMixture
-from proposer_rl.curricula.adr import BoundsCurriculum as BoundsCurriculum
-from proposer_rl.curricula.alp_gmm import MixtureCurriculum as MixtureCurriculum
+from proposer_rl.curricula.automatic_randomization import BoundsCurriculum as BoundsCurriculum
 from proposer_rl.curricula.bins import BinCurriculum as BinCurriculum
 from proposer_rl.curricula.buffer import ReplayRule as ReplayRule
 from proposer_rl.curricula.combinators import Filtered as Filtered
@@ -24,12 +23,13 @@ from proposer_rl.curricula.contract import Curriculum as Curriculum
 from proposer_rl.curricula.contract import Inbox as Inbox
 from proposer_rl.curricula.contract import LearnedCurriculum as LearnedCurriculum
 from proposer_rl.curricula.contract import outcome_of as outcome_of
-from proposer_rl.curricula.currot import TransportCurriculum as TransportCurriculum
 from proposer_rl.curricula.first_order import FirstOrderCurriculum as FirstOrderCurriculum
+from proposer_rl.curricula.gaussian_mixtures import MixtureCurriculum as MixtureCurriculum
 from proposer_rl.curricula.items import AdaptiveDifficulty as AdaptiveDifficulty
 from proposer_rl.curricula.items import ArcLengthFilter as ArcLengthFilter
 from proposer_rl.curricula.items import BetaSampling as BetaSampling
 from proposer_rl.curricula.items import CategoryBandit as CategoryBandit
+from proposer_rl.curricula.optimal_transport import TransportCurriculum as TransportCurriculum
 from proposer_rl.curricula.outcome_model import Modelled as Modelled
 from proposer_rl.curricula.problem_proposer import FirstOrderProposer as FirstOrderProposer
 from proposer_rl.curricula.problem_proposer import PairedProposer as PairedProposer
@@ -41,12 +41,12 @@ from proposer_rl.curricula.replay import ReplayCurriculum as ReplayCurriculum
 from proposer_rl.curricula.sampling import SamplingCurriculum as SamplingCurriculum
 from proposer_rl.curricula.sampling import SelectionCurriculum as SelectionCurriculum
 from proposer_rl.curricula.scores import Scorer as Scorer
-from proposer_rl.curricula.spdl import SelfPacedCurriculum as SelfPacedCurriculum
+from proposer_rl.curricula.self_paced import SelfPacedCurriculum as SelfPacedCurriculum
 from proposer_rl.curricula.student import Student as Student
 from proposer_rl.curricula.student import TaskStudent as TaskStudent
 from proposer_rl.curricula.student import UnfitStudentError as UnfitStudentError
 from proposer_rl.curricula.student import require as require
-from proposer_rl.curricula.terrain_levels import RowsCurriculum as RowsCurriculum
+from proposer_rl.curricula.terrain import RowsCurriculum as RowsCurriculum
 from proposer_rl.recipes import Recipe, available, own_recipe, recipe_function
 
 

@@ -17,7 +17,7 @@ REFUSED = [
     ([*CARS, "+method=regret"], "GymnasiumTask must define optimal_return(levels)"),
     ([*CARS, "+method=pace"], "must define differentiable_performance(agent, levels)"),
     ([*CARS, "+method=plr", "compute.collector=multiprocess"],
-     "leave compute.collector=single; task.vectorization=async spreads one Solver's env"),
+     "this method trains no replicas that workers could have; leave compute.collector=single"),
     ([*CARS, "+method=first_order_proposer"], "needs a student with target_direction"),
     ([*SEEDS, "+method=plr", "+filter=model"], "space: must have axes"),
     ([*VIEWS, "+method=first_order_gain"], "ViewMazeTask must define differentiable_performance"),
@@ -42,11 +42,11 @@ WHOLE = FIRST + FILE
 PARAMETERS = "  parameters:\n"
 MISREAD = [
     (FILE.encode(), "line.yaml must be '# @package _global_'"),
-    (WHOLE.encode("utf-8-sig"), "byte-order mark hides it: save the file as UTF-8"),
+    (WHOLE.encode("utf-8-sig"), "with no byte-order mark before it"),
     (("# a note\n" + WHOLE).encode(), "line.yaml must be '# @package _global_'"),
     (("# Größe\n" + WHOLE).encode("latin-1"), "'utf-8' codec can't decode"),
     (WHOLE.replace("defaults: [gymnasium, _self_]", "").encode(),
-     "task._target_: missing: the class that makes the task; a file of one's own has it"),
+     "task._target_: missing: the class or function that makes the task; a file of your own"),
     (WHOLE.encode("utf-16-le"), "line.yaml"),
     (WHOLE.replace("  env_id", "\tenv_id").encode(), "line.yaml"),
     (WHOLE.replace("values: [1.0, 2.0]", "low: 1, high: 2, bins: 257").encode(),

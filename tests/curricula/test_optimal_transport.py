@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from proposer_rl.curricula.currot import (
+from proposer_rl.curricula.optimal_transport import (
     TransportCurriculum,
     step_towards,
 )

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.mixture import GaussianMixture
 
-from proposer_rl.curricula import gaussians, points
-from proposer_rl.curricula.alp_gmm import (
+from proposer_rl.curricula import gaussian_mixtures, points
+from proposer_rl.curricula.gaussian_mixtures import (
     MixtureCurriculum,
     absolute_progress,
     draw_points,
@@ -175,7 +175,7 @@ def test_mixtures_are_made_of_the_last_window_when_it_is_full(
         made.append(points)
         return fit_mixture(points, most, generator)
 
-    monkeypatch.setattr(gaussians, "fit_mixture", noted)
+    monkeypatch.setattr(gaussian_mixtures, "fit_mixture", noted)
     task = Scripted(torch.rand(1, 8), batch_size=24)
     curriculum = small(task, warmup=70, refit=50)
     fitted = []
@@ -226,6 +226,6 @@ def test_performance_is_that_before_the_update_and_counted() -> None:
 
 
 def test_without_scikit_learn_a_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("proposer_rl.curricula.alp_gmm.find_spec", lambda name: None)
+    monkeypatch.setattr("proposer_rl.curricula.gaussian_mixtures.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"install it with: .*\[alp-gmm\]'?$"):
         small(Scripted(torch.zeros(1, 3)))

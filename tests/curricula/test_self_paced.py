@@ -11,7 +11,7 @@ from scipy.stats import kstest, truncnorm
 
 import proposer_rl as prl
 from proposer_rl.curricula import SelfPacedCurriculum
-from proposer_rl.curricula.spdl import (
+from proposer_rl.curricula.self_paced import (
     Floats,
     Gaussian,
     divergence,
