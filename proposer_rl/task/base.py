@@ -44,7 +44,6 @@ from proposer_rl.task.protocols import (
 )
 
 SAMPLES_SHOWN = 6  # levels of each distribution that a reader is shown
-NAMED = 128  # levels of a distribution that are evaluated one by one
 
 
 class Task(ABC):
@@ -404,7 +403,8 @@ class Task(ABC):
 
         Args:
             agent: K Solvers.
-            name: of the set: here of a distribution.
+            name: of the set: here of a distribution, whose evaluation levels are played as
+                :meth:`evaluate` plays them.
             max_steps: step limit of every level; None for the task's choice. Here nothing else.
 
         Raises:
@@ -415,9 +415,8 @@ class Task(ABC):
             raise ValueError(f"--levels {name}: must be one of: {', '.join(self.distributions)}")
         if max_steps is not None:
             raise ValueError("--max-steps: the step limit of this task's levels is fixed")
-        streams = Streams(0, "eval", name)
-        levels = self.evaluation_distribution(name).sample(NAMED, streams.generator())
-        performance = self.performance(agent, levels, streams.generator()).cpu()
+        levels = self.evaluation_levels(name)
+        performance = self.performance(agent, levels, self.stream("actions", name)).cpu()
         copies, count = performance.batch_size
 
         return [

@@ -283,6 +283,18 @@ def test_single_levels_are_of_the_seeds_that_are_measured_on() -> None:
         assert results and {value > 0 for value in results} == {trained}
 
 
+def test_single_levels_are_those_of_the_last_row_of_the_metrics() -> None:
+    task = walk_task()
+    agent = task.learner([Streams(0), Streams(1)]).agent
+    measured = task.measure(agent)
+    for name in task.evaluated_on:
+        rows = task.level_results(agent, name, None)
+        for result in task.results:
+            for solver in (0, 1):
+                mean = np.mean([row.results[result] for row in rows if row.solver == solver])
+                assert mean == pytest.approx(float(measured[f"{name}_{result}"][solver]))
+
+
 def test_one_parameter_can_set_several_numbers() -> None:
     both = ParameterSettings(name=["engine.speed", "wind"], values=[0.5, 1.0], target=1.0)
     player = LevelPlayer(MakeEnvironment(WALK), {"both": both}, GymLevel({"both": 0.5}, 0))
