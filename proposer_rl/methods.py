@@ -1,4 +1,4 @@
-"""How a curriculum is made of what its config says and of what the run has.
+"""Makes a curriculum from its configuration and the parts of a run.
 
 ``_target_`` of a config names the curriculum's class, see :func:`make`. The functions here are for
 curricula that one class and its settings do not make, such as those with a Proposer.

@@ -1,4 +1,4 @@
-"""What an argument may be is said once, in the signature.
+"""Validates arguments against annotated signatures.
 
 :func:`checked` holds a constructor or a factory to the types and bounds of its own signature, for
 whoever calls it; the command line asks the same of what it makes, by :func:`arguments`, and puts

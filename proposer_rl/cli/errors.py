@@ -1,4 +1,4 @@
-"""What stands on a command line, and what a command says that does not come to its end.
+"""Errors of the command line and exit codes.
 
 An error that is foreseen is a class with an ``exit_code``; its message is one line. Whatever is
 wrong with what a user gave is a :class:`ConfigError`, in every function of this room.

@@ -1,4 +1,4 @@
-"""What a command asks for: its overrides, its groups, and errors in composing them."""
+"""Reads what a command asks for: overrides, groups, and errors in composing them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``bin/train`` and ``proposer-train`` start: help at once, everything else with PyTorch."""
+"""Starts ``bin/train`` and ``proposer-train``; help comes before PyTorch is imported."""
 
 from __future__ import annotations
 

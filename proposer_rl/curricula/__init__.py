@@ -1,4 +1,4 @@
-"""What students train on: the curricula, and all that one of your own is made of.
+"""The curricula, and the parts to write one of your own.
 
 The contract is in :mod:`~proposer_rl.curricula.contract`, what a curriculum may ask of a student in
 :mod:`~proposer_rl.curricula.student`. ``curricula.plr()``, ``curricula.currot()`` and so on are

@@ -25,7 +25,7 @@ STATES = ("has not been handed out", "", "has been told before", "is over")
 
 
 class Block:
-    """What a curriculum has proposed at once: levels [K, n] whose ids follow one another.
+    """Holds one proposal of a curriculum: levels [K, n] whose ids follow one another.
 
     Attributes:
         start, end: the first id, and the one after the last.

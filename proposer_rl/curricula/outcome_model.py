@@ -1,4 +1,4 @@
-"""What students would reach on any level: regressions on what came of those they trained on.
+"""Predicts what students would reach on any level, by regression on the levels they trained on.
 
 Every update ends with labelled data, levels and what came of them, that cost nothing more. Of the
 last batches' rows phi_i with outcomes y_i, where what is ``age`` batches old has the weight

@@ -1,4 +1,4 @@
-"""How much there is to learn on a level, by what a student did there or by what it would do.
+"""Scores levels by how much there is to learn there, from episodes or from a student itself.
 
 A score from episodes reads a rollout [K, P, T], of which only episodes count that end in it: it is
 the mean over the steps of each, then the mean over the episodes of a level; minus infinity where

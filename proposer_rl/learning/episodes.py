@@ -1,4 +1,4 @@
-"""What Solvers reach in whole episodes: in those of a rollout, and in episodes played on levels."""
+"""Measures whole episodes: those of a rollout, and those played on levels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What PPO maximises, for K replicas at once: its numbers, advantages, the clipped loss, gradients.
+"""PPO for K replicas at once: its settings, advantages, the clipped loss, gradients.
 
 All of it is TorchRL's, without what would mix replicas or wait for a device; what is reported of a
 step is of each replica by itself, and refused where it is not finite. A rule that joins several

@@ -1,4 +1,4 @@
-"""What an update trains on: a rollout in the units of its moments, cut into shuffled parts."""
+"""Prepares an update: normalises a rollout and cuts it into shuffled minibatches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an action of the Proposer means: which of the space's N bins each of P levels is drawn from.
+"""Turns an action of the Proposer into bins: one of the space's N for each of P levels.
 
 A bin is a number, whatever it stands for; the task's space turns bins into levels.
 """

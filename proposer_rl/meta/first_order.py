@@ -1,4 +1,4 @@
-"""What training on a level would do to a Solver, from gradients: no replica of it is trained.
+"""Estimates from gradients what training on a level would do to a Solver, without training it.
 
 Training moves a Solver's parameters from theta to theta + d, and the performance R on the target by
 

@@ -1,4 +1,4 @@
-"""What methods are compared by, and the one decision on which of two is better."""
+"""Compares methods, and decides which of two is better."""
 
 from __future__ import annotations
 

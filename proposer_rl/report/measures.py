@@ -1,4 +1,4 @@
-"""What can be drawn of a study as curves: every measure once, for the figures and for the page."""
+"""The curves of a study, for the figures and for the page."""
 
 from __future__ import annotations
 

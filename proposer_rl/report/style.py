@@ -1,4 +1,4 @@
-"""How figures look: one colour for a method everywhere, and files that are the same every time."""
+"""The style of figures: one colour for each method, and the same bytes every time."""
 
 from __future__ import annotations
 

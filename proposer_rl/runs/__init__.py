@@ -1,1 +1,1 @@
-"""What a run leaves behind, and how it survives what may happen to it."""
+"""Run folders, checkpoints, and the process of a run."""

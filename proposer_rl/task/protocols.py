@@ -1,4 +1,4 @@
-"""What a task is made of, and what curricula may ask of some tasks beyond that.
+"""The interface of a task, and optional abilities that some curricula ask for.
 
 K are Solvers, P the levels of one update, E validation levels, N bins. What a task takes as a level
 is its own business: a tensordict or tensorclass of any content, whose batch shape alone matters.

@@ -1,4 +1,4 @@
-"""What parameters of levels may be, and what of it is the target, as files and Python say it.
+"""Ranges of parameters and their targets, as given in files and in Python.
 
 A parameter is a continuous range, whole numbers, or choices; :func:`read_line` and
 :class:`LineSettings` make bins of it, :func:`read_part` of a part of it, such as the target.

@@ -1,4 +1,4 @@
-"""What a teacher's state is of: plain descriptions, and what differs between two of them."""
+"""Describes what a teacher's state belongs to, and how two descriptions differ."""
 
 from __future__ import annotations
 

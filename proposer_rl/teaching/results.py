@@ -1,4 +1,4 @@
-"""What loops bring back, numbers or rollouts, as curricula observe it."""
+"""Turns a loop's results, numbers or rollouts, into outcomes that curricula observe."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is known of items and levels, as tables of numbers: categories, ranks, and few columns."""
+"""Turns features of items and levels into tables of numbers: categories, ranks, few columns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a step of an environment returns, and whether an episode is a success."""
+"""Checks what a step of an environment returns, and whether an episode is a success."""
 
 from __future__ import annotations
 

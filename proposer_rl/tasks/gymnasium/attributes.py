@@ -1,4 +1,4 @@
-"""What is inside an environment, by dotted names: ``gravity``, ``model.opt.gravity.2``."""
+"""Reads and sets an environment's attributes by dotted names such as ``model.opt.gravity.2``."""
 
 from __future__ import annotations
 

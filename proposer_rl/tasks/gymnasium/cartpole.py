@@ -1,4 +1,4 @@
-"""What a level sets in Gymnasium's CartPole beside plain attributes."""
+"""Sets the parameters of Gymnasium's CartPole that are no plain attributes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What levels are drawn from: a set of specifications, or a grid of them."""
+"""Distributions of mazes: a set of specifications, or a grid of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a policy per cell does in a maze: exactly, with its visits and episodes, or by playing.
+"""Evaluates a policy per cell in a maze: exactly, with visits and episodes, or by playing.
 
 A maze with a policy per cell is a Markov chain over its cells in which the goal absorbs. Both
 evaluators have one signature: ``evaluator(levels [*B], cell_logits [*B, 4, H, W], generator)``

@@ -1,4 +1,4 @@
-"""What the tasks on mazes share, whatever an agent can do and see there."""
+"""The common base of tasks on mazes, whatever an agent can do and see there."""
 
 from __future__ import annotations
 

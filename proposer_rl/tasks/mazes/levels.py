@@ -1,4 +1,4 @@
-"""What a maze is: its specification, its cells, its text and plane forms, and its shortest paths.
+"""Mazes: specification, cells, text and plane forms, and shortest paths.
 
 A batch is searched by spreading a frontier over all of its mazes at once. For that, grids are laid
 out *cells first*, ``[H, W, N]``: one shift of the grid is then a view whose rows are N contiguous

@@ -1,4 +1,4 @@
-"""What levels are drawn from: named kinds of them, and the Proposer's bins.
+"""Distributions of view mazes: named kinds, and the Proposer's bins.
 
 Drawn levels ``[N]`` are on the CPU, with height x width cells; so is the generator ``draw``.
 """
