@@ -42,10 +42,10 @@ def require_package(what: str, extra: str, *modules: str) -> None:
 
 
 def where_to_look(error: BaseException) -> str:
-    """Returns how a module is found that could not be imported; nothing for other errors."""
+    """Says where a missing module was looked for and how to add it; empty for other errors."""
     if not isinstance(error, ModuleNotFoundError):
         return ""
     return (
-        f"; {sys.executable} has looked for it: install it there, or if it is your own, name its "
-        "folder, as in PYTHONPATH=. bin/train ..."
+        f"; {sys.executable} cannot find it: install it there, or, if it is your own, put its "
+        "folder on PYTHONPATH, as in PYTHONPATH=. bin/train ..."
     )

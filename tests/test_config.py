@@ -102,8 +102,9 @@ WRONG = [
     ("curriculum._target_=os.nothing", "curriculum: No module named 'os.nothing'; "),
     (
         "curriculum._target_=my_parts.make",
-        f"curriculum: No module named 'my_parts'; {sys.executable} has looked for it: install it "
-        "there, or if it is your own, name its folder, as in PYTHONPATH=. bin/train ...",
+        f"curriculum: No module named 'my_parts'; {sys.executable} cannot find it: install it "
+        "there, or, if it is your own, put its folder on PYTHONPATH, as in PYTHONPATH=. bin/train "
+        "...",
     ),
     ("task._target_=my_parts.make", "task: No module named 'my_parts'; "),
     ("curriculum._target_=os.system", "curriculum: Target 'os.system' is"),

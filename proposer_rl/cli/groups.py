@@ -32,7 +32,7 @@ LONGEST = 120  # characters of a name that come from overrides
 
 
 class Invocation(NamedTuple):
-    """How a run was asked for; fixed when its configuration is composed.
+    """Holds how a run was asked for, fixed when its configuration is composed.
 
     Attributes:
         folder: the run's, absolute.
@@ -178,7 +178,7 @@ def check_groups(given: Sequence[str]) -> None:
 def check_chosen(config: DictConfig, hydra: Any) -> None:
     """Refuses a run without a method, and a file that Hydra has put below its group.
 
-    It does so with a file of one's own for want of its first line.
+    Hydra puts it there where the first line of a user's file is missing.
     """
     if config.method is None or config.curriculum is None:
         known = ", ".join(available("method"))

@@ -51,7 +51,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space, level_inputs
 
 Inputs = Callable[[Levels], Tensor]
-"""What is known of levels [*B]: float [*B, D], each about -1 to 1."""
+"""Maps levels [*B] to the inputs of a belief: float [*B, D], each about -1 to 1."""
 
 ARMS = ("target", "uniform", "bridge")
 TARGET, UNIFORM, BRIDGE = range(3)

@@ -47,7 +47,7 @@ from proposer_rl.task import Levels
 
 Labels = Literal["success", "above_worst"]
 Features = Callable[[Levels], Tensor]
-"""What a model knows of levels [K, n] by themselves: float [K, n, F], each about -1 to 1."""
+"""Maps levels [K, n] to the features of a model: float [K, n, F], each about -1 to 1."""
 
 KEPT = 4  # half-lives, after which a batch is forgotten
 STEPS = 50  # of Newton's method, at most
@@ -299,7 +299,7 @@ class Modelled(Combinator):
 
 
 class Predictions:
-    """What was predicted of levels, and what it was, since the last log."""
+    """Keeps predictions and outcomes of levels since the last log."""
 
     def __init__(self) -> None:
         self._seen: list[list[Tensor]] = []

@@ -16,7 +16,7 @@ from proposer_rl.task import Levels, Space, refuse_many_bins, refuse_unfit_bins
 
 CHUNK = 2**16  # places that are compared at once
 Place = Annotated[float, Interval(ge=-1, le=1)]
-"""Where a parameter lies in its range, from -1 to 1."""
+"""A parameter's place in its range, from -1 to 1."""
 
 
 class Points:

@@ -101,7 +101,7 @@ class Row(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """What is decided, with its p; a dash where nothing was asked."""
+        """The verdict with its p; a dash where nothing was asked."""
         told = self.decision and self.asked and self.decision.told(self.label)
         return told or "–"
 

@@ -53,7 +53,7 @@ class Group:
 
     @property
     def proposes(self) -> bool:
-        """Whether a Proposer was trained."""
+        """True if a Proposer was trained."""
         return any("total_reward" in cycle for run in self.runs for cycle in run.cycles)
 
     @property

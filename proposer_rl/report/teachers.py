@@ -38,7 +38,7 @@ class Log:
 
     @cached_property
     def x(self) -> Column:
-        """How many levels the line's teacher had been told, float [m]."""
+        """The number of levels that each line's teacher had been told, float [m]."""
         found, told = [], dict[Any, float]()
         for row in self.rows:
             whose = row.get("teacher")

@@ -129,7 +129,7 @@ class StopSignals:
 
     @property
     def pending(self) -> bool:
-        """Whether a signal has come."""
+        """True if a signal has come."""
         return self._pending is not None
 
     def check(self) -> None:

@@ -51,7 +51,7 @@ SIZES = ParameterSettings(set="argument", values=[3, 5], target=3)
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"env_id": "Nowhere-v0"}, r"env_id=Nowhere-v0: Environment `Nowhere` doesn't.*module:Name"),
     ({"env_id": "nowhere:Walk-v0"},
-     "env_id=nowhere:Walk-v0: No module named 'nowhere'.*has looked for it: install it there"),
+     "env_id=nowhere:Walk-v0: No module named 'nowhere'.*cannot find it: install it there"),
     ({"parameters": {"seed": PARAMETERS["width"]}}, "parameters.seed: is a column of training.csv"),
     ({"parameters": {"width": FALLING}}, r"parameters.width: values=\[2.0, 1.0\] must rise"),
     (one(), "parameters.a: Walk has no attribute 'a'; numbers that it has: width, wind"),
