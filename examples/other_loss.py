@@ -62,7 +62,7 @@ def main(cycles: int = 20) -> None:
         for cycle in range(cycles):
             stream = Streams(0, cycle)
             student = TaskStudent(task, task.learner([stream]))
-            outcome = curriculum.improve(student, [stream])
+            outcome = curriculum.improve(student, stream)
             gain = sum(outcome["return_gain"]) / len(outcome["return_gain"])
             print(f"{loss.__name__}, cycle {cycle}: mean gain of the replicas {gain:.2f}")
 

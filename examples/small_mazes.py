@@ -71,7 +71,7 @@ def train(
         experiment = Experiment(
             task,
             learner or task.learner([Streams(0, "solver")]),
-            curriculum,
+            [curriculum],
             schedule=ScheduleSettings(updates=updates, cycle_length=CYCLE, evaluate_every=CYCLE),
             seeds=[0],
             folder=RunFolder(Path(folder)),

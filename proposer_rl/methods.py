@@ -30,7 +30,6 @@ from proposer_rl.curricula import (
     SamplingCurriculum,
     Schedule,
     Scorer,
-    TaskStudent,
 )
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, PPOSettings, load_agent
 from proposer_rl.meta import rewards
@@ -413,7 +412,7 @@ def paired(
             "continue_episodes=True: the second Solver trains on whole levels, an update for each "
             "of the first one's; give False"
         )
-    return make(PairedProposer, {}, components, antagonist=TaskStudent(task, second), **policy)
+    return make(PairedProposer, {}, components, antagonist=second, **policy)
 
 
 def _problem_policy(

@@ -24,15 +24,15 @@ from proposer_rl.task import ComputeContext, Task
 
 
 class Made(NamedTuple):
-    """The task, the Solvers and the curriculum of an experiment."""
+    """The task, the Solvers and their curricula of an experiment."""
 
     task: Task
     learner: PPO
-    curriculum: Curriculum
+    curricula: list[Curriculum]
 
 
 def parts(config: RunConfig, signals: StopSignals, status: Status | None = None) -> Made:
-    """Makes task, Solvers and curriculum of an experiment; nothing is written yet."""
+    """Makes task, Solvers and their curricula; nothing is written yet."""
     if config.logger.type != "csv":
         require_package(f"logger={config.logger.type}", config.logger.type, config.logger.type)
     task = make_task(config)
@@ -40,10 +40,10 @@ def parts(config: RunConfig, signals: StopSignals, status: Status | None = None)
         learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
     with key("schedule"):
         check_headline(task, config.schedule)
-    curriculum = _curriculum(config, task, signals, status)
+    curricula = [_curriculum(config, task, seed, signals, status) for seed in config.seeds]
     with key("curriculum", "curriculum: ", (TypeError, ValueError)):
-        require(TaskStudent(task, learner), curriculum.needs, f"method={config.method}")
-    return Made(task, learner, curriculum)
+        require(TaskStudent(task, learner), curricula[0].needs, f"method={config.method}")
+    return Made(task, learner, curricula)
 
 
 def build(
@@ -96,7 +96,7 @@ def _made(maker: partial[Any], solver: SolverSettings, context: ComputeContext, 
 
 
 def _curriculum(
-    config: RunConfig, task: Task, signals: StopSignals, status: Status | None
+    config: RunConfig, task: Task, seed: int, signals: StopSignals, status: Status | None
 ) -> Curriculum:
     def on_update(done: int) -> None:
         if status is not None:
@@ -104,7 +104,7 @@ def _curriculum(
         signals.check()
 
     workers = _workers(config, task)
-    run = Components(task, config.proposer, config.seeds, on_update, workers)
+    run = Components(task, config.proposer, [seed], on_update, workers)
     with (
         key("curriculum", "curriculum: ", CANNOT_BE_CALLED),
         key("proposer", kinds=(ProposerError,)),

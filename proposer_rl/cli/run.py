@@ -93,7 +93,8 @@ def carry_out(config: RunConfig, asked: Invocation, signals: StopSignals, show: 
         except WorkersError as error:
             raise WorkersError(f"compute.{error}") from error
         finally:
-            made.curriculum.close()
+            for curriculum in made.curricula:
+                curriculum.close()
     finals = [float(row[config.schedule.headline]) for row in result["final"]]
     return sum(finals) / len(finals)
 
@@ -122,7 +123,7 @@ def proceed(
         described = {"planned_updates": config.schedule.updates, "task": made.task.facts}
         folder.write_json("run.json", {**facts, **described})
         result = experiment.run()
-        if learnt := made.curriculum.learnt():
+        if learnt := made.curricula[0].learnt():
             content = checkpoint_bytes(experiment.updates, {"curriculum": learnt})
             write_atomically(path / PROPOSER, content)
         summary = {**facts, **result}

@@ -20,7 +20,6 @@ from proposer_rl.curricula.combinators import Mixed as Mixed
 from proposer_rl.curricula.combinators import Schedule as Schedule
 from proposer_rl.curricula.contract import Batch as Batch
 from proposer_rl.curricula.contract import Curriculum as Curriculum
-from proposer_rl.curricula.contract import Inbox as Inbox
 from proposer_rl.curricula.contract import LearnedCurriculum as LearnedCurriculum
 from proposer_rl.curricula.contract import outcome_of as outcome_of
 from proposer_rl.curricula.first_order import FirstOrderCurriculum as FirstOrderCurriculum

@@ -41,9 +41,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from proposer_rl.curricula.batches import finite, packed
+from proposer_rl.curricula.batches import finite, levels_in
 from proposer_rl.curricula.belief import Belief
-from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.contract import Batch, Curriculum
 from proposer_rl.curricula.outcome_model import Predictions
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import Count, Share, checked
@@ -53,6 +53,7 @@ from proposer_rl.task import Distribution, Levels, Space, level_inputs
 Inputs = Callable[[Levels], Tensor]
 """Maps levels [*B] to the inputs of a belief: float [*B, D], each about -1 to 1."""
 
+RESULTS = ("return", "success")
 ARMS = ("target", "uniform", "bridge")
 TARGET, UNIFORM, BRIDGE = range(3)
 SUMS = (
@@ -106,7 +107,19 @@ class AdaptiveMixture(Curriculum):
         times: candidates for each level of the bridge.
     """
 
-    state = ("_inbox", "_sums", "_best", "_ends", "_number", "_told", "_seen", "_shown")
+    state = (
+        "_came",
+        "_sums",
+        "_best",
+        "_ends",
+        "_number",
+        "_told",
+        "_seen",
+        "_shown",
+        "_belief",
+        "_last",
+        "_some",
+    )
 
     @checked
     def __init__(
@@ -124,43 +137,46 @@ class AdaptiveMixture(Curriculum):
         self._is_data = hasattr(space, "items") and not hasattr(space, "between")
         self._known = inputs or partial(level_inputs, space)
         self._delta, self._half_life, self._times = delta, half_life, times
-        self._inbox = Inbox()
-        self._beliefs: list[Belief] = []  # of each student
-        self._sums = torch.zeros(0, len(ARMS), len(SUMS), dtype=torch.float64)
-        self._best = torch.zeros(0, dtype=torch.float64)  # success on the target, b
-        # The lowest returns and the negatives of the highest [2, K, m], of how many levels.
-        self._ends, self._number = torch.zeros(2, 0, 0, dtype=torch.float64), 0
+        one = space.sample(1, torch.Generator())
+        items = 0 if self._items(one) is None else space.size
+        expected = getattr(space, "expected", None)
+        width = self._inputs(one).shape[-1]
+        self._belief = Belief(width, items, expected=expected, half_life=half_life)
+        self._sums = torch.zeros(len(ARMS), len(SUMS), dtype=torch.float64)
+        self._best = torch.zeros((), dtype=torch.float64)  # success on the target, b
+        # The lowest returns and the negatives of the highest [2, m], of how many levels.
+        self._ends, self._number = torch.zeros(2, 0, dtype=torch.float64), 0
         self._told = False  # whether success is told
-        self._last: dict[str, Levels] = {}  # of the bridge, of each student [m]
+        self._last: Levels = one[:0]  # of the bridge, [m]
+        self._came: list[dict[str, Any]] = []  # what the next proposal learns from
         self._seen = Predictions()
-        self._some: dict[str, Levels] = {}  # of the last levels, by their arms
+        # Of the last proposal some levels, and their arms.
+        self._some = TensorDict(
+            {"level": self._last, "arm": torch.zeros(0, dtype=torch.int64)}, [0]
+        )
         self._shown: dict[str, Any] = {}
 
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Returns levels [K, n] of the three arms, in a random order."""
-        self._begin(len(streams))
-        self._take_in()
-        shares = self._shares()
-        made = [self._batch(k, count, shares[k], own) for k, own in enumerate(streams)]
-        levels, arms = (torch.stack(one) for one in zip(*made, strict=True))
+    def propose(self, student: Student, count: int, rng: Streams) -> Batch:
+        """Returns levels [n] of the three arms, in a random order."""
+        came, self._came = self._came, []
+        for seen, batches in together(came):
+            self._learn(seen, batches)
+        levels, arms = self._batch(count, self._shares(), rng.generator("levels"))
         inputs, items = self._inputs(levels), self._items(levels)
-        rows = zip(self._beliefs, inputs, _each(items, len(inputs)), strict=True)
-        predicted = torch.stack([belief.predict(x, which) for belief, x, which in rows])
-        self._some = some_of_each(levels[0], arms[0])
-        notes = {"arm": arms, "inputs": inputs, "predicted": predicted}
-        return self._inbox.batch(levels, **notes, **({} if items is None else {"items": items}))
+        few = torch.cat([(arms == i).nonzero().flatten()[:SHOWN] for i in range(len(ARMS))])
+        self._some = TensorDict({"level": levels[few], "arm": arms[few]}, [len(few)])
+        notes = {"arm": arms, "inputs": inputs, "predicted": self._belief.predict(inputs, items)}
+        if items is not None:
+            notes["items"] = items
+        return Batch(levels, TensorDict(notes, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Keeps what came of levels, which the next proposal learns from."""
-        self._inbox.check(batch, outcome)
-        results = {
-            name: outcome[name].double().cpu()
-            for name in ("return", "success")
-            if name in outcome.keys()
-        }
+        seen: dict[str, Any] = {name: outcome[name] for name in RESULTS if name in outcome.keys()}
         if "episodes" in outcome.keys() and "rollout" not in outcome.keys():
-            results["counts"] = outcome["episodes"].double().cpu()  # that the means are of
-        self._inbox.put(batch, **batch.notes.exclude("number", "place", "size"), **results)
+            seen["counts"] = outcome["episodes"]  # that the means are of
+        seen = {name: entry.double().cpu() for name, entry in seen.items()}
+        self._came.append({**batch.notes.to_dict(), **seen, "size": batch.size})
 
     def log(self) -> dict[str, Any]:
         """Returns the shares and what they follow from, and how right the belief was.
@@ -170,112 +186,73 @@ class AdaptiveMixture(Curriculum):
         :func:`~proposer_rl.curricula.outcome_model.calibration`.
         """
         shown, self._shown = self._shown, {}
-        if self._some:
-            shown["levels"], self._some = self._some, {}
+        if len(self._some):
+            levels, arms = self._some["level"], self._some["arm"]
+            shown["levels"] = {ARMS[i]: levels[arms == i] for i in arms.unique().tolist()}
+            self._some = self._some[:0]
         return shown | self._seen.log()
 
-    def state_dict(self) -> dict[str, Any]:
-        """Returns also the belief, the last levels of the bridge, and some of each arm."""
-        beliefs = [belief.state_dict() for belief in self._beliefs]
-        last, some = (
-            {name: packed(levels) for name, levels in of.items()} for of in (self._last, self._some)
-        )
-        return {**super().state_dict(), "beliefs": beliefs, "last": last, "some": some}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned."""
-        if state["beliefs"]:
-            self._begin(len(state["beliefs"]))
-        for belief, own in zip(self._beliefs, state["beliefs"], strict=True):
-            belief.load_state_dict(own)
-        super().load_state_dict(state)
-        like = type(self._space.sample(1, torch.Generator()))
-        self._last, self._some = (
-            {name: like.from_dict(one, batch_dims=1) for name, one in state[key].items()}
-            for key in ("last", "some")
-        )
-
-    def _begin(self, students: int) -> None:
-        if self._beliefs:
-            return
-        one = self._space.sample(1, torch.Generator())
-        items = 0 if self._items(one) is None else self._space.size
-        width = self._inputs(one).shape[-1]
-        expected = getattr(self._space, "expected", None)
-        made = (
-            Belief(width, items, expected=expected, half_life=self._half_life)
-            for _ in range(students)
-        )
-        self._beliefs = list(made)
-        self._sums = self._sums.new_zeros(students, *self._sums.shape[1:])
-        self._best = self._best.new_zeros(students)
-        self._ends = self._ends.new_zeros(2, students, 0)
-
-    def _take_in(self) -> None:
-        """Learns from the outcomes since the last proposal."""
-        for seen, batches in together(self._inbox.take()):
-            returns = seen["return"]
-            success, labels = self._labels(returns, seen.get("success", None))
-            which, counts = (_each(seen.get(n, None), len(labels)) for n in ("items", "counts"))
-            every = zip(self._beliefs, seen["inputs"], labels, which, counts, strict=True)
-            for belief, x, label, own, count in every:
-                belief.grow_older(batches)
-                belief.observe(x, label, own, count)
-            self._seen.add(seen["predicted"], success)
-            of = {
-                "levels": torch.ones_like(labels),
-                "successes": success,
-                "labels": labels,
-                "squared labels": labels.square(),
-                "predicted": seen["predicted"],
-                "squared predicted": seen["predicted"].square(),
-                "products": seen["predicted"] * labels,
-                "returns": returns,
-                "squared returns": returns.square(),
-            }
-            rows = torch.stack([of[name] for name in SUMS], -1)
-            arms = F.one_hot(seen["arm"], len(ARMS)).double().mT
-            self._sums = 0.5 ** (batches / SOON) * self._sums + arms @ rows
-            tried, won = self._sums[:, TARGET, :2].unbind(-1)
-            faded = 0.5 ** (batches / LATER) * self._best
-            self._best = torch.maximum(faded, won / (tried + FAILURES))
+    def _learn(self, seen: Mapping[str, Any], batches: float) -> None:
+        """Learns from what came of levels, with which batches, or a part of one, have passed."""
+        returns, predicted = seen["return"], seen["predicted"]
+        success, labels = self._labels(returns, seen.get("success"))
+        self._belief.grow_older(batches)
+        self._belief.observe(seen["inputs"], labels, seen.get("items"), seen.get("counts"))
+        self._seen.add(predicted, success)
+        of = {
+            "levels": torch.ones_like(labels),
+            "successes": success,
+            "labels": labels,
+            "squared labels": labels.square(),
+            "predicted": predicted,
+            "squared predicted": predicted.square(),
+            "products": predicted * labels,
+            "returns": returns,
+            "squared returns": returns.square(),
+        }
+        rows = torch.stack([of[name] for name in SUMS], -1)
+        arms = F.one_hot(seen["arm"], len(ARMS)).double().mT
+        self._sums = 0.5 ** (batches / SOON) * self._sums + arms @ rows
+        tried, won = self._sums[TARGET, :2]
+        faded = 0.5 ** (batches / LATER) * self._best
+        self._best = torch.maximum(faded, won / (tried + FAILURES))
 
     def _labels(self, returns: Tensor, success: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Returns what counts as success on levels, and what the belief learns, float64 [K, m]."""
-        self._number += returns.shape[1]
+        """Returns what counts as success on levels, and what the belief learns, float64 [m]."""
+        self._number += len(returns)
         ends = torch.cat([self._ends, torch.stack([returns, -returns])], -1)
         kept = min(MOST_OUTLIERS + 1, ends.shape[-1])
         self._ends = ends = ends.topk(kept, largest=False).values
         place = min(self._number // OUTLIERS, MOST_OUTLIERS)
-        low, high = ends[0, :, place, None], -ends[1, :, place, None]
+        low, high = ends[0, place], -ends[1, place]
         wide = high - low > EQUAL * torch.maximum(high.abs(), low.abs())
         grades = torch.where(wide, (returns - low) / (high - low), 0.5).clamp(0, 1)
         self._told = self._told or success is not None
         if success is None:
             return grades, grades
-        tried, won = self._sums[..., :2].sum(1).unbind(-1)
-        rare = won + success.sum(1) < RARE * (tried + success.shape[1])
-        return success, torch.where(rare.unsqueeze(1), torch.maximum(success, grades / 2), success)
+        tried, won = self._sums[:, :2].sum(0)
+        rare = won + success.sum() < RARE * (tried + len(success))
+        return success, torch.maximum(success, grades / 2) if rare else success
 
     def _shares(self) -> Tensor:
-        """Returns the shares of the arms in the next batch, float64 [K, 3]."""
+        """Returns the shares of the arms in the next batch, float64 [3]."""
         sums = dict(zip(SUMS, self._sums.unbind(-1), strict=True))
 
         def variance(name: str, of: Callable[[Tensor], Tensor]) -> Tensor:
-            """Returns the variance of what was summed up, of some arms: [K]."""
+            """Returns the variance of what was summed up, of some arms: []."""
             number, total, squares = (of(sums[n]) for n in ("levels", name, f"squared {name}"))
             square = squares / number
             found = square - (total / number).square()
             return found.where(found > EQUAL * square, 0.0)
 
-        own = variance("returns", lambda one: one[:, TARGET])
-        signal = (own / variance("returns", lambda one: one.sum(1))).sqrt()
+        own = variance("returns", lambda one: one[TARGET])
+        signal = (own / variance("returns", lambda one: one.sum())).sqrt()
         signal = signal.nan_to_num(1.0, posinf=1.0).clamp(max=1)  # before anything is seen
         number, came, expected, products = (
-            sums[name][:, UNIFORM] for name in ("levels", "labels", "predicted", "products")
+            sums[name][UNIFORM] for name in ("levels", "labels", "predicted", "products")
         )
         squares = [
-            number * variance(name, lambda one: one[:, UNIFORM]) + unsure
+            number * variance(name, lambda one: one[UNIFORM]) + unsure
             for name, unsure in zip(("predicted", "labels"), UNSURE, strict=True)
         ]
         covered = products - expected * came / number
@@ -288,39 +265,37 @@ class AdaptiveMixture(Curriculum):
         bridge = (BRIDGE_AT_ONCE + skill / 2).clamp(BRIDGE_LEAST, BRIDGE_MOST)
         shares = torch.stack([target, (1 - target) * (1 - bridge), (1 - target) * bridge], -1)
         self._shown |= {
-            "shares": {arm: shares[:, i].tolist() for i, arm in enumerate(ARMS)},
-            "target_success": self._best.tolist(),
-            "target_signal": signal.tolist(),
-            "skill": skill.tolist(),
+            "shares": dict(zip(ARMS, shares.tolist(), strict=True)),
+            "target_success": float(self._best),
+            "target_signal": float(signal),
+            "skill": float(skill),
         }
         return shares
 
-    def _batch(self, k: int, count: int, shares: Tensor, streams: Streams) -> tuple[Levels, Tensor]:
-        """Returns levels [n] of one student in a random order, and their arms."""
-        draw = streams.generator("levels")
+    def _batch(self, count: int, shares: Tensor, draw: torch.Generator) -> tuple[Levels, Tensor]:
+        """Returns levels [n] in a random order, and their arms."""
         arms = allotted(shares, count, draw)
         target, uniform, bridge = torch.bincount(arms, minlength=len(ARMS)).tolist()
         parts = [self._space.sample(uniform, draw)]
         if target and self._target is not None:
             parts = [self._target.sample(target, draw), *parts]
         if bridge:
-            parts.append(self._bridge(k, bridge, draw))
+            parts.append(self._bridge(bridge, draw))
         order = torch.randperm(count, generator=draw)
         return torch.cat(parts)[order], arms[order]
 
-    def _bridge(self, k: int, count: int, draw: torch.Generator) -> Levels:
+    def _bridge(self, count: int, draw: torch.Generator) -> Levels:
         """Returns levels [n] that are mastered, and near to the target."""
         goal = self._space if self._target is None else self._target
         targets = goal.sample(count, draw)
         times = self._times * (ITEMS_TIMES if self._is_data else 1)
-        levels = self._candidates(k, times * count, targets, draw)
+        levels = self._candidates(times * count, targets, draw)
         goals, x, items = self._inputs(targets), self._inputs(levels), self._items(levels)
-        belief = self._beliefs[k]
         # Items are explored by draws, which differ where little is known, or nothing new.
         if items is None or not self._is_data:
-            p = belief.predict(x, items)
+            p = self._belief.predict(x, items)
         else:
-            p = belief.draw(x, items, draw)
+            p = self._belief.draw(x, items, draw)
         allowed = p >= p.topk(count).values[-1].clamp(max=self._delta)
         bonus = ITEMS_LEARNABLE if self._is_data else LEARNABLE
         extra = torch.where(allowed, -bonus * 4 * p * (1 - p), FORBIDDEN)
@@ -336,22 +311,21 @@ class AdaptiveMixture(Curriculum):
             for costs in far.add_(extra[few].view(number, 1, -1)):
                 chosen.append(times * start + assigned(costs))
                 start += size
-        self._last[str(k)] = levels[torch.cat(chosen)]
-        return self._last[str(k)]
+        self._last = levels[torch.cat(chosen)]
+        return self._last
 
-    def _candidates(self, k: int, count: int, targets: Levels, draw: torch.Generator) -> Levels:
+    def _candidates(self, count: int, targets: Levels, draw: torch.Generator) -> Levels:
         """Returns levels [n] of the space and, if it can, between the last bridge and targets."""
         space: Any = self._space
         if self._is_data:  # none twice, where there are enough
             order = torch.randperm(space.size, generator=draw)
             places = order.repeat(-(-count // space.size))[:count]
-            made: Levels = space.generate(places[None], [draw])[0]
-            return made
+            return levels_in(space, places, draw)
         if not hasattr(space, "between"):
             return space.sample(count, draw)
         half = count // 2
         fresh = space.sample(count - half, draw)
-        last = self._last.get(str(k), fresh)
+        last = self._last if len(self._last) else fresh
         a = last[torch.randint(len(last), (half,), generator=draw)]
         b = targets[torch.randint(len(targets), (half,), generator=draw)]
         every = torch.cat([fresh, space.between(a, b, NEAR, draw)])
@@ -365,35 +339,24 @@ class AdaptiveMixture(Curriculum):
         return space.items(levels) if hasattr(space, "items") else None
 
 
-def _each(items: Tensor | None, students: int) -> Sequence[Tensor | None]:
-    return [None] * students if items is None else list(items)
-
-
-def together(parts: Sequence[TensorDict]) -> list[tuple[TensorDict, float]]:
-    """Returns parts of batches [K, m] as they are learned from, and the batches that pass by each.
+def together(parts: Sequence[dict[str, Any]]) -> list[tuple[dict[str, Any], float]]:
+    """Returns parts of batches [m] as they are learned from, and the batches that pass by each.
 
     Parts of more than LARGE levels are joined, with others of one kind, up to a batch.
     """
-    joined: list[tuple[TensorDict, float]] = []
-    for part in parts:
-        size = int(part["size"][0, 0])
-        share = part.shape[1] / max(size, FEW)
+    joined: list[tuple[dict[str, Any], float]] = []
+    for one in parts:
+        part = dict(one)
+        size = part.pop("size")
+        share = len(part["return"]) / max(size, FEW)
         if size > LARGE and joined:
             last, passed = joined[-1]
             if passed + share <= 1 and last.keys() == part.keys():
-                part, share = torch.cat([last, part], 1), passed + share
+                part = {name: torch.cat([last[name], entry]) for name, entry in part.items()}
+                share += passed
                 joined.pop()
         joined.append((part, share))
     return joined
-
-
-def some_of_each(levels: Levels, arms: Tensor) -> dict[str, Levels]:
-    """Returns the first few of levels [n] of each arm, for readers."""
-    return {
-        arm: levels[(arms == i).nonzero().flatten()[:SHOWN]]
-        for i, arm in enumerate(ARMS)
-        if (arms == i).any()
-    }
 
 
 def assigned(costs: Tensor) -> Tensor:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Any
 
 import torch
 from annotated_types import Interval
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
-from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.contract import Batch, Curriculum
 from proposer_rl.curricula.points import Place, Points, refuse_crossed
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import Count, checked
@@ -22,18 +21,18 @@ INSIDE = -1  # of a point that lies on no bound
 
 
 class BoundsCurriculum(Curriculum):
-    """Draws each student's levels uniformly within bounds, which move outwards where it succeeds.
+    """Draws levels uniformly within bounds, which move outwards where the student succeeds.
 
-    A level is a point of the box [-1, 1]^D that the space's coordinates span. Each student has a
-    lower and an upper bound of every coordinate, which begin at one point. A part of its levels lie
-    on a bound: one of the bounds, drawn uniformly, gives a coordinate, and the others are uniform
-    within theirs. What came of these levels is collected for each bound. When there are
-    ``episodes`` of them, the bound moves outwards by a step if their mean is at least ``upper``,
-    inwards if it is at most ``lower``, and collects anew (OpenAI et al. 2019, "Solving Rubik's Cube
-    with a Robot Hand", arXiv 1910.07113, algorithm 1).
+    A level is a point of the box [-1, 1]^D that the space's coordinates span. There are a lower and
+    an upper bound of every coordinate, which begin at one point. A part of the levels lie on a
+    bound: one of the bounds, drawn uniformly, gives a coordinate, and the others are uniform within
+    theirs. What came of these levels is collected for each bound. When there are ``episodes`` of
+    them, the bound moves outwards by a step if their mean is at least ``upper``, inwards if it is
+    at most ``lower``, and collects anew (OpenAI et al. 2019, "Solving Rubik's Cube with a Robot
+    Hand", arXiv 1910.07113, algorithm 1).
 
-    Levels on a bound that has moved since they were proposed do not count. Students train on all
-    levels, also those on bounds; bounds stay in the box, and never leave the start out.
+    Levels on a bound that has moved since they were proposed do not count. The student trains on
+    all levels, also those on bounds; bounds stay in the box, and never leave the start out.
 
     Args:
         space: that has the bins.
@@ -48,13 +47,13 @@ class BoundsCurriculum(Curriculum):
         rounded: see :class:`~proposer_rl.curricula.points.Points`.
 
     Attributes:
-        bounds: lower and upper ones, float64 [K, D, 2].
+        bounds: lower and upper ones, float64 [D, 2].
 
     Raises:
         ValueError: for an unknown axis, ``lower`` above ``upper``, or a space that has no points.
     """
 
-    state = ("bounds", "_sums", "_played", "_counts", "_inbox")
+    state = ("bounds", "_sums", "_played", "_counts")
 
     @checked
     def __init__(
@@ -79,59 +78,52 @@ class BoundsCurriculum(Curriculum):
         # Of the numbers of bounds that move, 2 d and 2 d + 1 are coordinate d's.
         self._movable = (2 * self._points.free.unsqueeze(-1) + torch.arange(2)).flatten()
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
-        self._inbox = Inbox()
-        self.bounds = torch.zeros(0, self._points.size, 2, dtype=torch.float64)
-        # What the levels on each bound came to since it has moved, and how many, [K, 2 D].
-        self._sums = torch.zeros(0, 2 * self._points.size, dtype=torch.float64)
-        self._played = torch.zeros(0, 2 * self._points.size, dtype=torch.int64)
+        self.bounds = self._start.expand(2, -1).mT.clone()
+        # What the levels on each bound came to since it has moved, and how many, [2 D].
+        self._sums = torch.zeros(2 * self._points.size, dtype=torch.float64)
+        self._played = torch.zeros(2 * self._points.size, dtype=torch.int64)
 
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Draws points within the bounds and on them, and returns levels [K, n] there."""
-        if not len(self.bounds):
-            self.bounds = self._start.expand(len(streams), 2, -1).mT.clone()
-            self._sums, self._played = (
-                torch.zeros(len(streams), 2 * self._points.size, dtype=known.dtype)
-                for known in (self._sums, self._played)
-            )
-        self._take_in()
-        drawn = [
-            self._draw(bounds, count, s.generator("choices"))
-            for bounds, s in zip(self.bounds, streams, strict=True)
-        ]
-        points, which, places = map(torch.stack, zip(*drawn, strict=True))
-        levels, bins = self._points.levels(points, streams)
-        return self._inbox.batch(levels, bins=bins, bound=which, at=places)
+    def propose(self, student: Student, count: int, rng: Streams) -> Batch:
+        """Draws points within the bounds and on them, and returns levels [n] there."""
+        points, which, places = self._draw(count, rng.generator("choices"))
+        levels, bins = self._points.levels(points, rng)
+        return Batch(levels, TensorDict({"bins": bins, "bound": which, "at": places}, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Keeps what levels on bounds came to, which the next proposal adds to the bounds' sums."""
-        self._inbox.check(batch, outcome)
-        reached = outcome[self._measure].double()
+        """Moves the bounds by what levels on them came to."""
         self._counts += counts_of_bins(batch.notes["bins"], self.space)
-        self._inbox.put(batch, **batch.notes.select("bound", "at"), reached=reached)
+        on_bound = batch.notes["bound"] != INSIDE
+        reached = outcome[self._measure].double().cpu()
+        seen = batch.notes["bound"], batch.notes["at"], reached
+        # Thousands at once: tensors would take a hundred times as long, number by number.
+        columns = (column[on_bound].tolist() for column in seen)
+        known = self.bounds, self._sums, self._played
+        bounds, sums, played = (each.flatten().tolist() for each in known)
+        for which, place, came_to in zip(*columns, strict=True):
+            if place == bounds[which]:
+                sums[which] += came_to
+                played[which] += 1
+                if played[which] == self._episodes:
+                    bounds[which] = self._moved(which, place, sums[which] / self._episodes)
+                    sums[which] = played[which] = 0
+        for each, now in zip(known, (bounds, sums, played), strict=True):
+            each.copy_(each.new_tensor(now).view_as(each))
 
     def log(self) -> dict[str, Any]:
         """Returns counts of levels by bin, the bounds, and the mean width between them."""
-        self._take_in()
-        if not len(self.bounds):
+        if not bool(self._counts.any()):
             return {}
         counts, self._counts = self._counts, torch.zeros_like(self._counts)
-        widths = self.bounds.diff(dim=-1).squeeze(-1)[:, self._points.free]
+        widths = self.bounds.diff(dim=-1).squeeze(-1)[self._points.free]
         return {
             "histogram": along_axes(counts, self.space),
             "bounds": self.bounds.tolist(),
-            "width": widths.mean(-1).tolist(),
+            "width": float(widths.mean()),
         }
 
-    def _draw(
-        self, bounds: Tensor, count: int, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Draws points [n, D] for one student; the bounds [n] that they lie on, and their places.
-
-        Args:
-            bounds: of the student, [D, 2].
-            count: number n.
-            generator: of the CPU.
-        """
+    def _draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Draws points [n, D]; returns the bounds [n] that they lie on, and their places."""
+        bounds = self.bounds
         shares = torch.rand(count, len(bounds), generator=generator, dtype=torch.float64)
         points = bounds[:, 0].lerp(bounds[:, 1], shares)
         on_bound = torch.rand(count, generator=generator) < self._boundary
@@ -140,27 +132,6 @@ class BoundsCurriculum(Curriculum):
         moved = points.scatter(1, (which // 2).unsqueeze(-1), places.unsqueeze(-1))
         points = moved.where(on_bound.unsqueeze(-1), points)
         return points, which.where(on_bound, INSIDE), places
-
-    def _take_in(self) -> None:
-        """Moves the bounds by what has come in, in the order of the proposals."""
-        for evidence in self._inbox.take():
-            for k, own in enumerate(evidence.unbind(0)):
-                on_bound = own["bound"] != INSIDE
-                columns = (own[name][on_bound].tolist() for name in ("bound", "at", "reached"))
-                # Thousands at once: tensors would take a hundred times as long, number by number.
-                bounds, sums, played = (
-                    known[k].flatten().tolist() for known in (self.bounds, self._sums, self._played)
-                )
-                for which, place, reached in zip(*columns, strict=True):
-                    if place == bounds[which]:
-                        sums[which] += reached
-                        played[which] += 1
-                        if played[which] == self._episodes:
-                            bounds[which] = self._moved(which, place, sums[which] / self._episodes)
-                            sums[which] = played[which] = 0
-                written = (self.bounds, bounds), (self._sums, sums), (self._played, played)
-                for known, now in written:
-                    known[k] = known.new_tensor(now).view_as(known[k])
 
     def _moved(self, which: int, place: float, mean: float) -> float:
         """Returns where a bound is after levels on it came to this in the mean."""

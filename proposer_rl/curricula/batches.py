@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from torch import Tensor
 
 from proposer_rl.settings import ArgumentError
-from proposer_rl.streams import Streams
-from proposer_rl.task import Distribution, Levels, Space
+from proposer_rl.task import Levels, Space
 
 CPU = torch.device("cpu")
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # and what follows: SplitMix64's
@@ -57,27 +56,22 @@ class SomeBins:
     def sample(self, count: int, generator: torch.Generator, /) -> Levels:
         """Draws levels [count]."""
         which = torch.randint(len(self.bins), (1, count), generator=generator)
-        return self._space.generate(self.bins[which], [generator])[0]
+        return levels_in(self._space, self.bins[which[0]], generator)
 
 
-def fresh_levels(
-    distribution: Distribution, count: int, streams: Sequence[Streams], *purpose: str | int
-) -> Levels:
-    """Draws levels [K, count] of a distribution, those of each student from its own stream."""
-    draws = [stream.generator(*purpose) for stream in streams]
-    return torch.stack([distribution.sample(count, generator) for generator in draws])
-
-
-def levels_at(levels: Levels, index: Tensor) -> Levels:
-    """Returns the levels [K, P] that stand at places int64 [K, P] of levels [K, N]."""
-    return levels[torch.arange(len(index)).unsqueeze(-1), index]
+def levels_in(space: Space, bins: Tensor, generator: torch.Generator) -> Levels:
+    """Returns levels [n] of a space's bins, int64 [n], one of each."""
+    levels: Levels = space.generate(bins.unsqueeze(0), [generator])[0]
+    return levels
 
 
 def saved(value: Any) -> Any:
     """Returns an attribute as a state holds it: its own state, or a copy of what it consists of.
 
-    Numbers, texts and tensors are copied, also in lists and dicts.
+    Numbers, texts, tensors, tensordicts and levels are copied, also in lists and dicts.
     """
+    if is_tensor_collection(value):
+        return packed(value)
     if hasattr(value, "state_dict"):
         return value.state_dict()
     if isinstance(value, Mapping):
@@ -90,8 +84,12 @@ def saved(value: Any) -> Any:
 def restored(state: Any, present: Any) -> Any:
     """Returns the attribute that a state holds.
 
-    An object with a state of its own is kept, and loads that.
+    An object with a state of its own is kept, and loads that. Levels, also those within a
+    tensordict, become of the class and go to the device of those that are there at present, of
+    which there may be none, ``levels[:0]``.
     """
+    if is_tensor_collection(present):
+        return unpacked(state, present)
     if not hasattr(present, "load_state_dict"):
         return saved(state)
     present.load_state_dict(state)
@@ -104,20 +102,25 @@ def packed(entries: TensorDictBase) -> dict[str, Any]:
     return state
 
 
-def unpacked(state: Mapping[str, Any], like: Levels | None) -> TensorDict:
-    """Returns the tensordict [K, m] that :func:`packed` put into a state.
+def unpacked(state: Mapping[str, Any], like: Any) -> Any:
+    """Returns the tensordict [m] that :func:`packed` put into a state.
 
-    Its entry ``level`` becomes levels of the same kind as ``like``.
+    It, and levels in it, become of the class and go to the device of ``like``.
     """
-    entries = TensorDict.from_dict(dict(state), batch_dims=2)
-    if "level" in entries:
-        entries["level"] = of_kind(like, state["level"])
-    return entries.clone()
+    if isinstance(like, TensorDict):
+        entries = {
+            name: unpacked(entry, like.get(name)) if isinstance(entry, Mapping) else entry.clone()
+            for name, entry in state.items()
+        }
+        made: Any = TensorDict(entries).auto_batch_size_(1)
+    else:
+        made = of_kind(like, state).clone()
+    return moved(made, device_of(like)) if len([*like.keys(True, True)]) else made
 
 
 def of_kind(like: Levels, state: Mapping[str, Any]) -> Levels:
-    """Returns levels [K, m] of the class of ``like``, from nested dicts of their entries."""
-    return type(like).from_dict(state, batch_dims=2)
+    """Returns levels [m] of the class of ``like``, from nested dicts of their entries."""
+    return type(like).from_dict(state, batch_dims=1)
 
 
 def finite(name: str, numbers: Tensor) -> Tensor:

@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.batches import levels_in
+from proposer_rl.curricula.contract import Batch, Curriculum
 from proposer_rl.curricula.student import Student
 from proposer_rl.meta.actions import systematic_draw
 from proposer_rl.settings import Count, checked
@@ -21,7 +22,7 @@ Measure = Literal["success", "return"]
 
 
 class BinCurriculum(Curriculum):
-    """Draws its batches from shares of the bins, which it renews now and then in a scoring pass.
+    """Draws batches from shares of the bins, which it renews now and then in a scoring pass.
 
     A subclass says what a scoring pass is, what the shares are made of, and what is learnt from
     outcomes.
@@ -33,7 +34,7 @@ class BinCurriculum(Curriculum):
 
     shown: ClassVar[Sequence[str]] = ("score",)
     """Scores that are logged."""
-    state: ClassVar[tuple[str, ...]] = ("scores", "_counts", "_proposed", "_inbox")
+    state: ClassVar[tuple[str, ...]] = ("scores", "_counts", "_proposed")
 
     @checked
     def __init__(self, space: Space, *, every: Count) -> None:
@@ -41,47 +42,36 @@ class BinCurriculum(Curriculum):
         self.space, self._every = space, every
         self._proposed = 0
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
-        self._inbox = Inbox()
-        self.scores: dict[str, Tensor] = {}  # what the shares come from, each [K, N], on the CPU
+        self.scores: dict[str, Tensor] = {}  # what the shares come from, each [N], on the CPU
 
     @abstractmethod
-    def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
+    def score(self, student: Student, count: int, rng: Streams) -> None:
         """Renews :attr:`scores` for batches of ``count`` levels."""
 
     @abstractmethod
     def shares(self) -> Tensor:
-        """Returns the shares of the bins in the next batch, float [K, N], which add up to one."""
+        """Returns the shares of the bins in the next batch, float [N], which add up to one."""
 
-    def evidence(
-        self, student: Student, batch: Batch, outcome: TensorDictBase
-    ) -> dict[str, Tensor]:
-        """Returns what :meth:`learn` needs of an outcome, tensors [K, n] by name."""
-        return {}
+    def learn(self, bins: Tensor, outcome: TensorDictBase) -> None:
+        """Learns from the outcome [m] of levels in bins int64 [m]."""
 
-    def learn(self, evidence: TensorDict) -> None:
-        """Learns from the evidence of one batch, [K, m], which also has the levels' ``bins``."""
-
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Draws levels [K, n] systematically from the shares of the bins."""
-        self._take_in()
+    def propose(self, student: Student, count: int, rng: Streams) -> Batch:
+        """Draws levels [n] systematically from the shares of the bins."""
         if self._proposed % self._every == 0:
-            self.score(student, count, streams)
+            self.score(student, count, rng)
         self._proposed += 1
-        draws, levels = ([s.generator(key) for s in streams] for key in ("choices", "levels"))
-        bins = systematic_draw(self.shares(), count, draws)
-        return self._inbox.batch(self.space.generate(bins, levels), bins=bins)
+        bins = systematic_draw(self.shares()[None], count, [rng.generator("choices")])[0]
+        levels = levels_in(self.space, bins, rng.generator("levels"))
+        return Batch(levels, TensorDict({"bins": bins}, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Counts the levels, and keeps what can be learnt from them until the next proposal."""
-        self._inbox.check(batch, outcome)
-        evidence = self.evidence(student, batch, outcome)
-        self._counts += counts_of_bins(batch.notes["bins"], self.space)
-        if evidence:
-            self._inbox.put(batch, bins=batch.notes["bins"], **evidence)
+        """Counts the levels, and learns from what came of them."""
+        bins = batch.notes["bins"]
+        self._counts += counts_of_bins(bins, self.space)
+        self.learn(bins, outcome)
 
     def log(self) -> dict[str, Any]:
-        """Returns counts of levels by bin, the scores, and how even each student's shares are."""
-        self._take_in()
+        """Returns counts of levels by bin, the scores, and how even the shares are."""
         if not self.scores:
             return {}
         shares, counts = self.shares(), self._counts
@@ -89,13 +79,9 @@ class BinCurriculum(Curriculum):
         return {
             "histogram": along_axes(counts, self.space),
             **{name: along_axes(self.scores[name], self.space) for name in self.shown},
-            "share_entropy": torch.special.entr(shares).sum(-1).tolist(),
-            "effective_bins": (1 / shares.square().sum(-1)).tolist(),
+            "share_entropy": float(torch.special.entr(shares).sum()),
+            "effective_bins": float(1 / shares.square().sum()),
         }
-
-    def _take_in(self) -> None:
-        for evidence in self._inbox.take():
-            self.learn(evidence)
 
 
 def counts_of_bins(bins: Tensor, space: Space) -> Tensor:
@@ -117,30 +103,27 @@ def means_of_bins(choices: Tensor, values: Tensor, size: int) -> tuple[Tensor, T
     """Returns the mean value of the levels of each bin, and how many levels it had.
 
     Args:
-        choices: bins of the levels, int64 [K, P].
-        values: of the levels, float [K, P].
+        choices: bins of the levels, int64 [n].
+        values: of the levels, float [n].
         size: number N of bins.
 
     Returns:
-        float [K, N], NaN where there was no level; float [K, N].
+        float [N], NaN where there was no level; float [N].
 
     Example:
-        >>> choices, values = torch.tensor([[2, 0, 2]]), torch.tensor([[0.0, 1.0, 1.0]])
-        >>> means_of_bins(choices, values, 3)
-        (tensor([[1.0000,    nan, 0.5000]]), tensor([[1., 0., 2.]]))
+        >>> means_of_bins(torch.tensor([2, 0, 2]), torch.tensor([0.0, 1.0, 1.0]), 3)
+        (tensor([1.0000,    nan, 0.5000]), tensor([1., 0., 2.]))
     """
-    none = values.new_zeros(len(values), size)
-    counts = none.scatter_add(1, choices, torch.ones_like(values))
-    return none.scatter_add(1, choices, values) / counts, counts
+    none = values.new_zeros(size)
+    counts = none.scatter_add(0, choices, torch.ones_like(values))
+    return none.scatter_add(0, choices, values) / counts, counts
 
 
 class Probes:
-    """Fixed levels of every bin, each student's own, on which its performance is measured.
+    """Fixed levels of every bin, on which the student's performance is measured.
 
     The levels are drawn at the first time, from the streams of that proposal, and stay. What is
-    measured is exact where the student's performance is; otherwise all students of a population
-    draw from the streams of the first, so that then one of several does not do what it would do
-    alone.
+    measured is exact where the student's performance is.
 
     Args:
         space: that has the bins.
@@ -150,36 +133,35 @@ class Probes:
 
     def __init__(self, space: Space, count: int, measure: Measure) -> None:
         self._space, self._count, self.measure = space, count, measure
-        self._drawn_from: list[list[Any]] = []
+        self._drawn_from: list[Any] = []
         self._levels: Any = None
 
-    def performance(self, student: Student, streams: Sequence[Streams]) -> Tensor:
-        """Measures the mean performance of K students in each bin: float32 [K, N], on the CPU.
+    def performance(self, student: Student, rng: Streams) -> Tensor:
+        """Measures the student's mean performance in each bin: float32 [N], on the CPU.
 
         Raises:
             NoSuccessError: if success is to be measured and the task has none.
         """
         size = self._space.size
         if self._levels is None:
-            self._drawn_from = self._drawn_from or [s.address for s in streams]
+            self._drawn_from = self._drawn_from or rng.address
             bins = torch.arange(size).repeat_interleave(self._count)
-            own = [Streams(*address).generator("probes") for address in self._drawn_from]
-            self._levels = self._space.generate(bins.expand(len(own), -1), own)
-        draws = streams[0].generator("probe_episodes")
-        performance = student.performance(self._levels, draws)
+            draw = Streams(*self._drawn_from).generator("probes")
+            self._levels = levels_in(self._space, bins, draw)
+        performance = student.performance(self._levels, rng.generator("probe_episodes"))
         if self.measure not in performance.keys():
             raise NoSuccessError(
                 f"measure={self.measure}: this task tells no success, only the return; give "
                 "measure=return"
             )
-        reached = performance[self.measure].unflatten(-1, (size, self._count)).mean(-1)  # [K, N]
+        reached = performance[self.measure].unflatten(-1, (size, self._count)).mean(-1)  # [N]
         return reached.float().cpu()
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the addresses of the streams that the levels are drawn from."""
-        return {"drawn_from": [list(address) for address in self._drawn_from]}
+        """Returns the address of the streams that the levels are drawn from."""
+        return {"drawn_from": list(self._drawn_from)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Puts back what :meth:`state_dict` returned; the levels are then drawn again."""
         self._levels = None
-        self._drawn_from = [list(address) for address in state["drawn_from"]]
+        self._drawn_from = list(state["drawn_from"])

@@ -1,4 +1,4 @@
-"""A buffer of N levels for each of K Solvers, and functions that change it.
+"""A buffer of N levels, and functions that change it.
 
 Prioritised level replay (Jiang et al. 2021, arXiv 2010.03934, section 3) keeps levels with a score
 of how much there is to learn on them, and draws them again from
@@ -6,7 +6,7 @@ of how much there is to learn on them, and draws them again from
     P  =  (1 - staleness) w  +  staleness u,
 
 w the *score weights* and u, which is proportional to the time since a level was last drawn or
-scored, the *staleness weights*. A buffer is a tensordict [K, N] on the CPU:
+scored, the *staleness weights*. A buffer is a tensordict [N] on the CPU:
 
 - ``level``: the levels;
 - ``filled`` bool: whether there is one; nothing else of an empty slot counts;
@@ -20,7 +20,7 @@ scored, the *staleness weights*. A buffer is a tensordict [K, N] on the CPU:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -54,9 +54,9 @@ class ReplayRule:
     staleness: Share = 0.3
 
 
-def empty_buffer(level: Any, students: int, capacity: int) -> TensorDict:
-    """Returns an empty buffer [students, capacity] for levels of the kind of the given one, []."""
-    shape = (students, capacity)
+def empty_buffer(level: Any, capacity: int) -> TensorDict:
+    """Returns an empty buffer [capacity] for levels of the kind of the given one, []."""
+    shape = (capacity,)
     numbers = ("touched", "clock", "key", "parent", "generation", "draws")
     return TensorDict(
         {
@@ -148,35 +148,28 @@ def draw_slots(
     buffer: TensorDictBase,
     count: int,
     rule: ReplayRule,
-    generators: Sequence[torch.Generator],
-    wanted: Tensor | None = None,
+    generator: torch.Generator,
 ) -> Tensor:
     """Draws levels one after another: each draw advances the clock and makes its level fresh.
 
     Args:
-        buffer: with a level in some slot of every student that is drawn for.
-        count: number P of draws.
+        buffer: with a level in some slot.
+        count: number n of draws.
         rule: of the draws.
-        generators: one for each student.
-        wanted: bool [K], of the students that are drawn for; None for all.
+        generator: of the CPU.
 
     Returns:
-        Slots int64 [K, P]; those of other students are 0.
+        Slots int64 [n].
     """
     entries = dict(buffer.items())
     by_score = score_weights(entries["score"], entries["filled"], rule).numpy()
-    slots = torch.zeros(len(generators), count, dtype=torch.int64)
-    for student in _chosen(wanted, len(slots)):
-        noise = torch.rand(count, generator=generators[student], dtype=torch.float64).numpy()
-        drawn = draw_row(_row(entries, student), by_score[student], rule.staleness, noise)
-        slots[student] = torch.from_numpy(drawn)
-        entries["draws"][student].scatter_add_(0, slots[student], torch.ones_like(slots[student]))
+    noise = torch.rand(count, generator=generator, dtype=torch.float64).numpy()
+    slots = torch.from_numpy(draw_row(_numbers(entries), by_score, rule.staleness, noise))
+    entries["draws"].scatter_add_(0, slots, torch.ones_like(slots))
     return slots
 
 
-def insert(
-    buffer: TensorDictBase, new: TensorDictBase, rule: ReplayRule, wanted: Tensor | None = None
-) -> None:
+def insert(buffer: TensorDictBase, new: TensorDictBase, rule: ReplayRule) -> None:
     """Inserts levels that were scored, one after another.
 
     A level that is there already gets its new score. Another one gets the next free slot; where
@@ -184,41 +177,38 @@ def insert(
     that one's. Equal levels among the new ones count once, with the mean of their scores.
 
     Args:
-        buffer: [K, N].
-        new: [K, M] with ``level``, ``score`` and ``best``, and where it is not zero ``parent`` and
+        buffer: [N].
+        new: [M] with ``level``, ``score`` and ``best``, and where it is not zero ``parent`` and
             ``generation``; ``reached`` where they were trained on. Scores that are not finite are
             those of levels not to be kept.
         rule: of the draws.
-        wanted: bool [K], of the students whose levels are inserted; None for all.
     """
 
     def weigh(falling: Floats) -> Floats:
         count = torch.tensor([len(falling)])
         return shares_by_rank(torch.from_numpy(falling), count, rule).numpy()
 
-    by_rank = rule.prioritization == "rank"
     entries, fresh = dict(buffer.items()), dict(new.items())
     keys = level_keys(fresh["level"])
-    none, unknown = torch.zeros_like(keys), torch.full(keys.shape, -torch.inf)
-    for student in _chosen(wanted, len(keys)):
-        score, best = _of_equals(keys[student], fresh["score"][student], fresh["best"][student])
-        given = _row(entries, student), keys[student].numpy(), score.numpy(), rule.staleness, weigh
-        source, again = map(torch.from_numpy, insert_row(*given, by_rank))
-        there = entries["best"][student]
-        there.scatter_reduce_(0, again[0], best[again[1]].to(there), "amax")
-        slots = (source >= 0).nonzero().flatten()
-        which = source[slots]
-        kept = {
-            "best": best,
-            "parent": fresh.get("parent", none)[student],
-            "generation": fresh.get("generation", none)[student],
-            "draws": none[student],
-            "reached": fresh.get("reached", unknown)[student],
-        }
-        for name, entry in kept.items():
-            there = entries[name][student]
-            there[slots] = entry[which].to(there)
-        entries["level"][student, slots] = moved(fresh["level"][student, which], CPU)
+    score, best = _of_equals(keys, fresh["score"], fresh["best"])
+    given = _numbers(entries), keys.numpy(), score.numpy(), rule.staleness, weigh
+    by_rank = rule.prioritization == "rank"
+    source, again = map(torch.from_numpy, insert_row(*given, by_rank))
+    there = entries["best"]
+    there.scatter_reduce_(0, again[0], best[again[1]].to(there), "amax")
+    slots = (source >= 0).nonzero().flatten()
+    which = source[slots]
+    none = torch.zeros_like(keys)
+    kept = {
+        "best": best,
+        "parent": fresh.get("parent", none),
+        "generation": fresh.get("generation", none),
+        "draws": none,
+        "reached": fresh.get("reached", torch.full(keys.shape, -torch.inf)),
+    }
+    for name, entry in kept.items():
+        entries[name][slots] = entry[which].to(entries[name])
+    entries["level"][slots] = moved(fresh["level"][which], CPU)
 
 
 def rescore(
@@ -231,25 +221,25 @@ def rescore(
     """Replaces the scores of levels that were drawn by new ones.
 
     Args:
-        buffer: [K, N].
-        slots: int64 [K, P]; of a slot that occurs several times the mean score counts.
-        score: float [K, P]; one that is not finite leaves the level's old score.
-        best: float [K, P], the highest returns, of which the highest ever is kept.
-        reached: float [K, P], the returns, taken as scores are; None where nobody was trained.
+        buffer: [N].
+        slots: int64 [m]; of a slot that occurs several times the mean score counts.
+        score: float [m]; one that is not finite leaves the level's old score.
+        best: float [m], the highest returns, of which the highest ever is kept.
+        reached: float [m], the returns, taken as scores are; None where nobody was trained.
     """
     new = {"score": score, **({} if reached is None else {"reached": reached})}
     for name, entry in new.items():
         there = buffer[name]
         there.copy_(_mean_of_slots(there, slots, entry))
     there = buffer["best"]
-    there.scatter_reduce_(1, slots, best.to(there), "amax")
+    there.scatter_reduce_(0, slots, best.to(there), "amax")
 
 
 def lineage(buffer: TensorDictBase, most: int) -> Tensor:
     """Returns the slots of the longest line of levels, each edited from the one before: int64 [m].
 
     Args:
-        buffer: of one student, [N].
+        buffer: [N].
         most: slots of the line, counted from its end, that are returned at most.
     """
     place = {key: slot for slot, key in enumerate(buffer["key"].tolist())}
@@ -278,14 +268,10 @@ def _mean_of_slots(old: Tensor, slots: Tensor, new: Tensor) -> Tensor:
     return means.to(old).where(counts > 0, old)
 
 
-def _chosen(wanted: Tensor | None, students: int) -> list[int]:
-    return list(range(students)) if wanted is None else wanted.nonzero().flatten().tolist()
-
-
-def _row(entries: Mapping[str, Any], student: int) -> dict[str, Any]:
-    """Returns the numbers of one student as arrays [N] that share the buffer's memory."""
+def _numbers(entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the numbers of a buffer as arrays [N] that share its memory."""
     names = ("filled", "score", "key", "touched", "clock")
-    return {name: entries[name][student].numpy() for name in names}
+    return {name: entries[name].numpy() for name in names}
 
 
 def _of_equals(key: Tensor, score: Tensor, best: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ from annotated_types import Interval, Len
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.contract import Batch, Curriculum, LearnedCurriculum
+from proposer_rl.curricula.contract import Batch, Curriculum, LearnedCurriculum, proposed
 from proposer_rl.curricula.scores import Scorer
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import ArgumentError, NotNegative, Positive, checked
@@ -33,9 +33,9 @@ class Combinator(LearnedCurriculum):
         )
         self.trains_replicas = any(part.trains_replicas for part in self._learned())
 
-    def improve(self, student: Student, streams: Sequence[Streams]) -> dict[str, Any]:
+    def improve(self, student: Student, rng: Streams) -> dict[str, Any]:
         """Improves the parts that train something."""
-        improved = [part.improve(student, streams) for part in self._learned()]
+        improved = [part.improve(student, rng) for part in self._learned()]
         return {key: value for metrics in improved for key, value in metrics.items()}
 
     def log(self) -> dict[str, Any]:
@@ -104,14 +104,13 @@ class Filtered(Combinator):
         self.required_results = tuple(dict.fromkeys((*self.required_results, *scorer.plays_for)))
         self._scorer, self._times, self._temperature = scorer, times, temperature
 
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+    def propose(self, student: Student, count: int, rng: Streams) -> Batch:
         """Draws a larger batch from the curriculum, and returns the levels of it that are kept."""
-        candidates = self.parts[0].propose(student, self._times * count, streams)
-        scored = self._scorer(student, candidates.levels, streams, "choice")
-        draws = [s.generator("choice") for s in streams]
-        return candidates.keep(
-            draw_without_replacement(scored.score / self._temperature, count, draws)
-        )
+        candidates = proposed(self.parts[0], student, self._times * count, rng)
+        scored = self._scorer(student, candidates.levels, rng, "choice")
+        draw = rng.generator("choice")
+        kept = candidates[draw_without_replacement(scored.score / self._temperature, count, draw)]
+        return Batch(kept.levels, kept.notes)
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Passes the outcome on to the curriculum that is filtered."""
@@ -144,27 +143,24 @@ class Schedule(Combinator):
         self._until = list(until)
         self._proposed = 0
 
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+    def propose(self, student: Student, count: int, rng: Streams) -> Batch:
         """Returns what the present stage proposes."""
         stage = self._stage
-        batch = self.parts[stage].propose(student, count, streams)
+        batch = proposed(self.parts[stage], student, count, rng)
         self._proposed += 1
-        which = torch.full(batch.notes.batch_size, stage)
-        notes = {"stage": which, "notes": batch.notes}
-        return Batch(batch.levels, TensorDict(notes, batch.notes.batch_size))
+        notes = {"stage": torch.full((count,), stage), "notes": batch.notes}
+        return Batch(batch.levels, TensorDict(notes, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Passes the outcome on to the stage that has proposed the levels."""
-        if batch.count:
-            stage = int(batch.notes["stage"][0, 0])
-            self.parts[stage].observe(student, Batch(batch.levels, batch.notes["notes"]), outcome)
+        if len(batch):
+            own = Batch(batch.levels, batch.notes["notes"], batch.size)
+            self.parts[int(batch.notes["stage"][0])].observe(student, own, outcome)
 
-    def improve(self, student: Student, streams: Sequence[Streams]) -> dict[str, Any]:
+    def improve(self, student: Student, rng: Streams) -> dict[str, Any]:
         """Improves the stage that the cycle begins with."""
         part = self.parts[self._stage]
-        if isinstance(part, LearnedCurriculum):
-            return part.improve(student, streams)
-        return {}
+        return part.improve(student, rng) if isinstance(part, LearnedCurriculum) else {}
 
     @property
     def _stage(self) -> int:
@@ -193,33 +189,32 @@ class Mixed(Combinator):
             )
         self._ends = [sum(shares[: i + 1]) / sum(shares) for i in range(len(shares))]
 
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Returns levels [K, n], those of the first curriculum first."""
+    def propose(self, student: Student, count: int, rng: Streams) -> Batch:
+        """Returns levels [n], those of the first curriculum first."""
         ends = [round(end * count) for end in self._ends]
         counts = [end - start for start, end in zip([0, *ends], ends, strict=False)]
-        proposed = {
-            i: self.parts[i].propose(student, some, [s.within("part", i) for s in streams])
+        batches = {
+            i: proposed(self.parts[i], student, some, rng.within("part", i))
             for i, some in enumerate(counts)
             if some
         }
-        shape = (len(streams), count)
         whose = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
         # Every level has an entry for each curriculum; of another one than its own, any.
         place = torch.cat([torch.arange(some) for some in counts])
         notes = {
-            str(i): batch.notes[:, place.clamp(max=batch.count - 1)]
-            for i, batch in proposed.items()
+            str(i): batch.notes[place.clamp(max=len(batch) - 1)] for i, batch in batches.items()
         }
-        levels = torch.cat([batch.levels for batch in proposed.values()], 1)
-        return Batch(levels, TensorDict({"part": whose.expand(shape).clone(), **notes}, shape))
+        levels = torch.cat([batch.levels for batch in batches.values()])
+        sizes = torch.tensor(counts)[whose]
+        return Batch(levels, TensorDict({"part": whose, "size": sizes, **notes}, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Gives every curriculum the outcome of what it has proposed."""
-        whose = batch.notes["part"][0] if batch.count else torch.zeros(0)
+        whose, sizes = batch.notes["part"], batch.notes["size"]
         for i in whose.unique().tolist():
             own = (whose == i).nonzero().flatten()
-            part = Batch(batch.levels[:, own], batch.notes[str(i)][:, own])
-            self.parts[i].observe(student, part, outcome[:, own])
+            part = Batch(batch.levels[own], batch.notes[str(i)][own], int(sizes[own[0]]))
+            self.parts[i].observe(student, part, outcome[own])
 
     def log(self) -> dict[str, Any]:
         """Returns the log of each curriculum, whose entries begin with its number."""
@@ -237,25 +232,20 @@ def _mixes(curriculum: Curriculum) -> bool:
     return isinstance(curriculum, Mixed) or any(map(_mixes, parts))
 
 
-def draw_without_replacement(
-    logits: Tensor, count: int, generators: Sequence[torch.Generator]
-) -> Tensor:
+def draw_without_replacement(logits: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Draws places one after another, in proportion to exp(logit) of those that are left.
 
     The largest of the logits with Gumbel noise are such draws (Kool et al. 2019, arXiv 1903.06059).
 
     Args:
-        logits: float [K, M]; minus infinity for places that are only drawn where no
-            other is left.
+        logits: float [M]; minus infinity for places that are only drawn where no other is left.
         count: number n of draws.
-        generators: one for each row.
+        generator: of the CPU.
 
     Returns:
-        int64 [K, n], no place twice.
+        int64 [n], no place twice.
     """
-    uniform = torch.stack(
-        [torch.rand(logits.shape[1], generator=g, dtype=torch.float64) for g in generators]
-    )
+    uniform = torch.rand(len(logits), generator=generator, dtype=torch.float64)
     gumbel = -(-uniform.log()).log()
     # Lower than any score, but finite: noise decides among levels without one.
     return (logits.double().nan_to_num(neginf=-1e9) + gumbel).topk(count).indices

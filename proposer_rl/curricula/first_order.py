@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from proposer_rl.curricula.batches import fresh_levels
+from proposer_rl.curricula.batches import levels_in
 from proposer_rl.curricula.bins import BinCurriculum, along_axes
 from proposer_rl.curricula.student import Student
 from proposer_rl.meta.first_order import TargetMeasure, bin_scores
@@ -59,13 +58,13 @@ class FirstOrderCurriculum(BinCurriculum):
         self._target, self._target_levels = target, target_levels
         self._candidates, self._step, self._measure = candidates, step, measure
 
-    def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
+    def score(self, student: Student, count: int, rng: Streams) -> None:
         """Scores every bin by fresh levels, and averages the scores over time."""
         size, each = self.space.size, self._candidates
-        target = fresh_levels(self._target, self._target_levels, streams, "target")
+        target = self._target.sample(self._target_levels, rng.generator("target"))
         reached, direction = student.target_direction(target, self._measure)
-        bins = torch.arange(size).repeat_interleave(each).expand(len(streams), -1)
-        levels = self.space.generate(bins, [s.generator("candidates") for s in streams])
+        bins = torch.arange(size).repeat_interleave(each)
+        levels = levels_in(self.space, bins, rng.generator("candidates"))
         aligned = student.alignment(direction, levels, self._step)
         score, error = (x.cpu() for x in bin_scores(aligned.unflatten(-1, (size, each))))
         old = self.smoothing if self.scores else 0.0
@@ -77,7 +76,7 @@ class FirstOrderCurriculum(BinCurriculum):
         }
 
     def shares(self) -> Tensor:
-        """Returns the shares of the bins in the next batch, float [K, N]."""
+        """Returns the shares of the bins in the next batch, float [N]."""
         score = self.scores["score"]
         largest = score.abs().amax(-1, keepdim=True).clamp_min(torch.finfo(score.dtype).tiny)
         return (score / (self._temperature * largest)).softmax(-1)
@@ -86,7 +85,7 @@ class FirstOrderCurriculum(BinCurriculum):
         """Returns also the target's performance when last scored, and the scores' errors."""
         record = super().log()
         if record:
-            record["target_performance"] = self.scores["target"].tolist()
+            record["target_performance"] = float(self.scores["target"])
         if record and self._candidates > 1:
             record["score_error"] = along_axes(self.scores["variance"].sqrt(), self.space)
         return record

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Interval
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.bins import along_axes, counts_of_bins
-from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.contract import Batch, Curriculum
 from proposer_rl.curricula.points import Points, nearest
 from proposer_rl.curricula.student import Student
 from proposer_rl.extras import install_command
@@ -26,11 +25,11 @@ TwoOrMore = Annotated[int, Interval(ge=2, le=1_000_000)]
 
 
 class MixtureCurriculum(Curriculum):
-    """Draws each student's levels as points of a box, and rounds them to the space's bins.
+    """Draws levels as points of a box, and rounds them to the space's bins.
 
     A point of the box [-1, 1]^D that the space's coordinates span is rounded to a bin, whose
     coordinates x are the task. The progress of an episode on x with return r is |r - r'|, with r'
-    that of the nearest earlier task in the student's whole history. The first ``warmup`` points are
+    that of the nearest earlier task in the whole history. The first ``warmup`` points are
     drawn uniformly from the box; then, at every ``refit`` episodes, a mixture of Gaussians is
     fitted to the points and the progress of the last ``refit``, from which all but a part of the
     draws come (Portelas et al. 2019, arXiv 1910.07224, algorithm 1; see
@@ -61,7 +60,7 @@ class MixtureCurriculum(Curriculum):
             space has a single bin.
     """
 
-    state = ("_history", "_mixtures", "_fitted", "_counts", "_drawn", "_inbox")
+    state = ("_history", "_mixture", "_fitted", "_counts", "_drawn")
 
     @checked
     def __init__(
@@ -89,89 +88,77 @@ class MixtureCurriculum(Curriculum):
         self.needs = ("performance",) if source == "exact" else ()
         self._source, self._components, self._refit = source, components, refit
         self._warmup, self._exploration = warmup, exploration
-        # Points and tasks [K, H, D], returns and progress [K, H], float64 on the CPU.
+        # Points and tasks [H, D], returns and progress [H], float64 on the CPU.
         self._history: dict[str, Tensor] = {}
-        self._mixtures: list[tuple[Tensor, Tensor]] = []  # of each student: see fit_mixture
+        self._mixture: list[Tensor] = []  # see fit_mixture
         self._fitted = 0  # episodes at the last fit
-        self._inbox = Inbox()
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._drawn = torch.zeros(2, dtype=torch.int64)  # from mixtures, and clipped of these
 
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Draws points, and returns levels [K, n] of the bins nearest to them."""
-        self._take_in()
-        self._fit(streams)
-        drawn = [self._draw(k, count, s.generator("choices")) for k, s in enumerate(streams)]
-        points = torch.stack(drawn)
-        levels, bins = self._points.levels(points, streams)
+    def propose(self, student: Student, count: int, rng: Streams) -> Batch:
+        """Draws points, and returns levels [n] of the bins nearest to them."""
+        self._fit(rng)
+        points = self._draw(count, rng.generator("choices"))
+        levels, bins = self._points.levels(points, rng)
         notes = {"bins": bins, "points": points}
         if self._source == "exact":
-            reached = student.performance(levels, streams[0].generator("performance"))["return"]
+            reached = student.performance(levels, rng.generator("performance"))["return"]
             notes["returns"] = reached.double().cpu()
-        return self._inbox.batch(levels, **notes)
+        return Batch(levels, TensorDict(notes, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Keeps tasks and returns, which the next proposal adds to the histories."""
-        self._inbox.check(batch, outcome)
+        """Adds tasks, returns and progress to the history."""
         notes = batch.notes
         self._counts += counts_of_bins(notes["bins"], self.space)
-        returns = outcome["return"].double() if self._source == "episodes" else notes["returns"]
-        self._inbox.put(batch, points=notes["points"], bins=notes["bins"], returns=returns)
+        returns = outcome["return"] if self._source == "episodes" else notes["returns"]
+        points, returns = notes["points"], returns.double().cpu()
+        tasks = self._points.tasks(points, notes["bins"])
+        progress = torch.zeros_like(returns)
+        if history := self._history:
+            progress = absolute_progress(history["tasks"], history["returns"], tasks, returns)
+        new = {"points": points, "tasks": tasks, "returns": returns, "progress": progress}
+        self._history = {
+            name: torch.cat([history[name], entry]) if history else entry
+            for name, entry in new.items()
+        }
 
     def log(self) -> dict[str, Any]:
-        """Returns counts of levels by bin, the mixtures, and how often a draw was clipped."""
-        self._take_in()
+        """Returns counts of levels by bin, the mixture, and how often a draw was clipped."""
         if not self._history:
             return {}
         drawn, clipped = self._drawn.tolist()
         self._drawn = torch.zeros_like(self._drawn)
         counts, self._counts = self._counts, torch.zeros_like(self._counts)
+        means = self._mixture[0].tolist() if self._mixture else []
         return {
             "histogram": along_axes(counts, self.space),
-            "progress": self._history["progress"][:, -self._refit :].mean(1).tolist(),
-            "components": [len(means) for means, _ in self._mixtures],
-            "means": [means.tolist() for means, _ in self._mixtures],
+            "progress": float(self._history["progress"][-self._refit :].mean()),
+            "components": len(means),
+            "means": means,
             "clipped": clipped / drawn if drawn else 0.0,
         }
 
-    def _take_in(self) -> None:
-        """Adds tasks, returns and progress to the histories."""
-        for evidence in self._inbox.take():
-            points, returns = evidence["points"], evidence["returns"]
-            tasks = self._points.tasks(points, evidence["bins"])
-            progress = torch.zeros_like(returns)
-            if history := self._history:
-                past = zip(history["tasks"], history["returns"], tasks, returns, strict=True)
-                progress = torch.stack([absolute_progress(*own) for own in past])
-            new = {"points": points, "tasks": tasks, "returns": returns, "progress": progress}
-            self._history = {
-                name: torch.cat([history[name], entry], 1) if history else entry
-                for name, entry in new.items()
-            }
-
-    def _fit(self, streams: Sequence[Streams]) -> None:
-        """Fits new mixtures if it is time."""
-        episodes = self._history["returns"].shape[1] if self._history else 0
+    def _fit(self, rng: Streams) -> None:
+        """Fits a new mixture if it is time."""
+        episodes = len(self._history["returns"]) if self._history else 0
         due = episodes // self._refit > self._fitted // self._refit
         if episodes < self._warmup or not due:
             return
-        last = {name: entry[:, -self._refit :] for name, entry in self._history.items()}
-        seen = torch.cat([last["points"], last["progress"].unsqueeze(-1)], -1)  # [K, refit, D + 1]
-        self._mixtures = [
-            fit_mixture(own, self._components, s.generator("mixture"))
-            for own, s in zip(seen, streams, strict=True)
-        ]
+        last = {name: entry[-self._refit :] for name, entry in self._history.items()}
+        seen = torch.cat([last["points"], last["progress"].unsqueeze(-1)], -1)  # [refit, D + 1]
+        self._mixture = [*fit_mixture(seen, self._components, rng.generator("mixture"))]
         self._fitted = episodes
 
-    def _draw(self, student: int, count: int, generator: torch.Generator) -> Tensor:
-        """Draws a batch of points for one student, float64 [n, D]."""
+    def _draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Draws points, float64 [n, D]."""
         uniform = (
             2 * torch.rand(count, self._points.size, generator=generator, dtype=torch.float64) - 1
         )
-        if not self._mixtures:
+        if not self._mixture:
             return uniform
         explored = torch.rand(count, generator=generator) < self._exploration
-        drawn = draw_points(*self._mixtures[student], count, generator)
+        means, covariances = self._mixture
+        drawn = draw_points(means, covariances, count, generator)
         kept = drawn.clamp(-1, 1)
         clipped = (kept != drawn).any(-1) & ~explored
         self._drawn = self._drawn + torch.stack([(~explored).sum(), clipped.sum()])

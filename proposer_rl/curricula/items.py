@@ -14,14 +14,14 @@ from __future__ import annotations
 import math
 import warnings
 from abc import abstractmethod
-from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.batches import levels_in
+from proposer_rl.curricula.contract import Batch, Curriculum
 from proposer_rl.curricula.outcome_model import Predictions
 from proposer_rl.curricula.scores import mixed, single
 from proposer_rl.curricula.student import Student
@@ -43,80 +43,66 @@ class ItemCurriculum(Curriculum):
     """
 
     required_results = ("success",)
-    state: ClassVar[tuple[str, ...]] = ("_inbox", "numbers", "_seen")
+    state: ClassVar[tuple[str, ...]] = ("_came", "numbers", "_seen")
 
     def __init__(self, space: Space) -> None:
         refuse_unfit_bins(space)
         self.space = space
-        self.numbers: dict[str, Tensor] = {}  # each [K, ...]; none before the first proposal
-        self._inbox = Inbox()
+        self.numbers: dict[str, Tensor] = {}  # none before the first proposal
+        self._came: list[dict[str, Tensor]] = []  # what the next proposal learns from
         self._seen = Predictions()
 
     @abstractmethod
-    def first_numbers(self, students: int) -> dict[str, Tensor]:
-        """Returns the numbers of items before anything is known, by name, each [K, ...]."""
+    def first_numbers(self) -> dict[str, Tensor]:
+        """Returns the numbers of items before anything is known, by name."""
 
     @abstractmethod
-    def draw(self, own: dict[str, Tensor], count: int, generator: torch.Generator) -> Tensor:
-        """Draws places of items of one student, int64 [n].
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Draws places of items, int64 [n].
 
         Args:
-            own: the student's numbers.
             count: number n of items, perhaps more than there are.
             generator: of the CPU.
         """
 
     @abstractmethod
-    def learn(self, own: dict[str, Tensor], seen: dict[str, Tensor]) -> None:
-        """Moves numbers of one student, in place, by a batch.
+    def learn(self, seen: dict[str, Tensor]) -> None:
+        """Moves the numbers, in place, by a batch.
 
         Args:
-            own: the student's numbers.
-            seen: ``place`` of the items, int64 [n], ``success`` and ``count`` of answers, float64.
+            seen: ``item``, places int64 [m], ``success`` and ``count`` of answers, float64 [m].
         """
 
-    def expected(self, own: dict[str, Tensor]) -> Tensor | None:
+    def expected(self) -> Tensor | None:
         """Returns the expected success on each item, float64 [N], if there is such a belief."""
         return None
 
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Returns items [K, n], each once where there are enough."""
-        self.numbers = self.numbers or self.first_numbers(len(streams))
-        self._take_in()
-        rows = [self._own(k) for k in range(len(streams))]
-        draws, levels = ([s.generator(key) for s in streams] for key in ("choices", "levels"))
-        each = zip(rows, draws, strict=True)
-        places = torch.stack([self.draw(own, count, g) for own, g in each])
+    def propose(self, student: Student, count: int, rng: Streams) -> Batch:
+        """Returns items [n], each once where there are enough."""
+        self.numbers = self.numbers or self.first_numbers()
+        came, self._came = self._came, []
+        for seen in came:
+            self.learn(seen)
+            if "predicted" in seen:
+                self._seen.add(seen["predicted"], seen["success"])
+        places = self.draw(count, rng.generator("choices"))
         notes = {"item": places}
-        if (guesses := [self.expected(own) for own in rows])[0] is not None:
-            notes["predicted"] = torch.stack(guesses).gather(1, places)  # type: ignore[arg-type]
-        return self._inbox.batch(self.space.generate(places, levels), **notes)
+        if (guesses := self.expected()) is not None:
+            notes["predicted"] = guesses[places]
+        levels = levels_in(self.space, places, rng.generator("levels"))
+        return Batch(levels, TensorDict(notes, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Keeps what came of items, which the next proposal learns from."""
-        self._inbox.check(batch, outcome)
         success = outcome["success"].double().cpu()
         counts = torch.ones_like(success)
         if "rollout" not in outcome.keys():  # whose success is that of its first episode
             counts = outcome.get("episodes", counts).double().cpu()
-        notes = batch.notes.exclude("number", "place", "size")
-        self._inbox.put(batch, **notes, success=success, count=counts)
+        self._came.append({**batch.notes.to_dict(), "success": success, "count": counts})
 
     def log(self) -> dict[str, Any]:
         """Returns how right the belief was, as of the adaptive mixture, if there is one."""
         return self._seen.log()
-
-    def _take_in(self) -> None:
-        for came in self._inbox.take():
-            for k in range(len(came)):
-                seen = {name: came[name][k] for name in ("item", "success", "count")}
-                self.learn(self._own(k), seen)
-            if "predicted" in came.keys():
-                self._seen.add(came["predicted"], came["success"])
-
-    def _own(self, k: int) -> dict[str, Tensor]:
-        """Returns views of the numbers of a student."""
-        return {name: each[k] for name, each in self.numbers.items()}
 
 
 class BetaSampling(ItemCurriculum):
@@ -139,26 +125,29 @@ class BetaSampling(ItemCurriculum):
         super().__init__(space)
         self._decay, self._aim = decay, aim
 
-    def first_numbers(self, students: int) -> dict[str, Tensor]:
-        """Returns a and b, float64 [K, N]."""
-        one = torch.ones(students, self.space.size, dtype=torch.float64)
+    def first_numbers(self) -> dict[str, Tensor]:
+        """Returns a and b, float64 [N]."""
+        one = torch.ones(self.space.size, dtype=torch.float64)
         return {"a": one, "b": one.clone()}
 
-    def draw(self, own: dict[str, Tensor], count: int, generator: torch.Generator) -> Tensor:
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Draws the items nearest to the aim."""
         # What is public, torch.distributions, takes no generator.
-        a, b = (torch._standard_gamma(own[name], generator=generator) for name in ("a", "b"))
+        a, b = (
+            torch._standard_gamma(self.numbers[name], generator=generator) for name in ("a", "b")
+        )
         return nearest(a / (a + b) - self._aim, count, generator)
 
-    def learn(self, own: dict[str, Tensor], seen: dict[str, Tensor]) -> None:
+    def learn(self, seen: dict[str, Tensor]) -> None:
         """Moves the Beta distributions of the items that were seen."""
         items, answers, right = per_item(seen)
         for name, number in (("a", right), ("b", answers - right)):
-            own[name][items] = self._decay * own[name][items] + 1 - self._decay + number
+            own = self.numbers[name]
+            own[items] = self._decay * own[items] + 1 - self._decay + number
 
-    def expected(self, own: dict[str, Tensor]) -> Tensor:
+    def expected(self) -> Tensor:
         """Returns a / (a + b)."""
-        return own["a"] / (own["a"] + own["b"])
+        return self.numbers["a"] / (self.numbers["a"] + self.numbers["b"])
 
 
 class AdaptiveDifficulty(ItemCurriculum):
@@ -198,24 +187,24 @@ class AdaptiveDifficulty(ItemCurriculum):
         self._difficulty = 1 - rates
         self._step, self._sensitivity, self._aim = step, sensitivity, aim
 
-    def first_numbers(self, students: int) -> dict[str, Tensor]:
-        """Returns the difficulty T, float64 [K, 1]."""
-        return {"difficulty": self._difficulty.min().repeat(students, 1)}
+    def first_numbers(self) -> dict[str, Tensor]:
+        """Returns the difficulty T, float64 [1]."""
+        return {"difficulty": self._difficulty.min().repeat(1)}
 
-    def draw(self, own: dict[str, Tensor], count: int, generator: torch.Generator) -> Tensor:
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Draws the items nearest to T."""
-        return nearest(self._difficulty - own["difficulty"], count, generator)
+        return nearest(self._difficulty - self.numbers["difficulty"], count, generator)
 
-    def learn(self, own: dict[str, Tensor], seen: dict[str, Tensor]) -> None:
+    def learn(self, seen: dict[str, Tensor]) -> None:
         """Moves T."""
         reward = (seen["success"] * seen["count"]).sum() / seen["count"].sum()
         moved = self._step * (self._sensitivity * (reward - self._aim)).tanh()
         low, high = self._difficulty.min(), self._difficulty.max()
-        own["difficulty"].add_(moved).clamp_(low, high)
+        self.numbers["difficulty"].add_(moved).clamp_(low, high)
 
     def log(self) -> dict[str, Any]:
-        """Returns T of each student."""
-        return {name: each[:, 0].tolist() for name, each in self.numbers.items()}
+        """Returns T."""
+        return {name: float(each) for name, each in self.numbers.items()}
 
 
 class CategoryBandit(ItemCurriculum):
@@ -249,14 +238,14 @@ class CategoryBandit(ItemCurriculum):
         self._categories, self._warned = categories, False
         self._rate, self._temperature = rate, temperature
 
-    def first_numbers(self, students: int) -> dict[str, Tensor]:
-        """Returns the values Q, float64 [K, C]."""
+    def first_numbers(self) -> dict[str, Tensor]:
+        """Returns the values Q, float64 [C]."""
         size = int(self._categories.max()) + 1
-        return {"value": torch.zeros(students, size, dtype=torch.float64)}
+        return {"value": torch.zeros(size, dtype=torch.float64)}
 
-    def draw(self, own: dict[str, Tensor], count: int, generator: torch.Generator) -> Tensor:
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Draws categories systematically, and items of each without replacement."""
-        shares = (own["value"] / self._temperature).softmax(0)
+        shares = (self.numbers["value"] / self._temperature).softmax(0)
         drawn = systematic_draw(shares[None], count, [generator])[0]
         places = torch.empty_like(drawn)
         for category in drawn.unique():
@@ -266,10 +255,10 @@ class CategoryBandit(ItemCurriculum):
             places[these] = members[order]
         return places
 
-    def learn(self, own: dict[str, Tensor], seen: dict[str, Tensor]) -> None:
+    def learn(self, seen: dict[str, Tensor]) -> None:
         """Moves the values of the categories that were seen."""
         category, p = self._categories[seen["item"]], seen["success"]
-        zero = torch.zeros_like(own["value"])
+        zero = torch.zeros_like(self.numbers["value"])
         number = zero.index_add(0, category, torch.ones_like(p))
         spread = 2 * (p * (1 - p)).sqrt()
         if not self._warned and single(seen["count"]) and not spread.any():
@@ -280,10 +269,10 @@ class CategoryBandit(ItemCurriculum):
                 stacklevel=2,
             )
         reward = zero.index_add(0, category, spread) / number.clamp(min=1)
-        own["value"].lerp_(reward, self._rate * (number > 0).double())
+        self.numbers["value"].lerp_(reward, self._rate * (number > 0).double())
 
     def log(self) -> dict[str, Any]:
-        """Returns the values of categories, of each student."""
+        """Returns the values of categories."""
         return {name: each.tolist() for name, each in self.numbers.items()}
 
 
@@ -322,10 +311,10 @@ class ArcLengthFilter(ItemCurriculum):
         self._noise, self._drift_noise = noise, drift_noise
         self._width, self._slack = width, slack
 
-    def first_numbers(self, students: int) -> dict[str, Tensor]:
-        """Returns arc lengths and their variances [K, N], the drift and its variance, and G."""
-        shape = students, self.space.size
-        one = torch.ones(students, 1, dtype=torch.float64)
+    def first_numbers(self) -> dict[str, Tensor]:
+        """Returns arc lengths and their variances [N], the drift and its variance, and G."""
+        shape = (self.space.size,)
+        one = torch.ones(1, dtype=torch.float64)
         return {
             "psi": torch.full(shape, math.pi / 4, dtype=torch.float64),
             "variance": torch.full(shape, PRIOR, dtype=torch.float64),
@@ -334,17 +323,19 @@ class ArcLengthFilter(ItemCurriculum):
             "answers": 2 * one,
         }
 
-    def draw(self, own: dict[str, Tensor], count: int, generator: torch.Generator) -> Tensor:
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Draws items without replacement, by their scores."""
+        own = self.numbers
         wanted = wanted_arc(float(own["answers"]), self._slack)
         spread = own["variance"] + self._width**2
         overlap = -(own["psi"] - wanted).square() / (2 * spread) - spread.log() / 2
-        score = overlap + mixed(self.expected(own), own["answers"]).clamp(min=1e-9).log()
+        score = overlap + mixed(self.expected(), own["answers"]).clamp(min=1e-9).log()
         waits = torch.empty_like(score).exponential_(generator=generator)
         return nearest(waits.log() - score, count, generator, smallest=True)
 
-    def learn(self, own: dict[str, Tensor], seen: dict[str, Tensor]) -> None:
+    def learn(self, seen: dict[str, Tensor]) -> None:
         """Lets a batch pass, and moves the arc lengths of the items that were seen."""
+        own = self.numbers
         items, answers, right = per_item(seen)
         own["psi"].add_(own["drift"]).clamp_(0, math.pi / 2)
         own["variance"].add_(self._noise).clamp_(max=PRIOR)
@@ -360,8 +351,9 @@ class ArcLengthFilter(ItemCurriculum):
         own["drift_variance"].mul_(1 - part)
         own["answers"].fill_(max(float(answers.mean()), 2.0))
 
-    def expected(self, own: dict[str, Tensor]) -> Tensor:
+    def expected(self) -> Tensor:
         """Returns the expectation of sin^2 of the arc lengths."""
+        own = self.numbers
         return (1 - (-2 * own["variance"]).exp() * (2 * own["psi"]).cos()) / 2
 
 

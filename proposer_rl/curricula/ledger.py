@@ -25,23 +25,22 @@ STATES = ("has not been handed out", "", "has been told before", "is over")
 
 
 class Block:
-    """Holds one proposal of a curriculum: levels [K, n] whose ids follow one another.
+    """Holds one proposal of a curriculum: levels [n] whose ids follow one another.
 
     Attributes:
         start, end: the first id, and the one after the last.
         batch: as it was proposed; see :meth:`Ledger.take` for when it is cut down.
-        levels: those that were proposed, [K, n].
-        state: of each level for each student, uint8 [K, n].
-        results: by name, [K, n]; NaN or None where there is none yet.
+        levels: those that were proposed, [n].
+        state: of each level, uint8 [n].
+        results: by name, [n]; NaN or None where there is none yet.
     """
 
     def __init__(self, start: int, batch: Batch, kinds: Mapping[str, type]) -> None:
-        shape = batch.levels.shape[:2]
-        self.start, self.end = start, start + shape[1]
+        self.start, self.end = start, start + len(batch)
         self.batch, self.levels = batch, batch.levels
-        self.state = np.full(shape, WAITING, np.uint8)
+        self.state = np.full(len(batch), WAITING, np.uint8)
         self.results: dict[str, NDArray[Any]] = {
-            name: np.full(shape, None if kind is object else np.nan, kind)
+            name: np.full(len(batch), None if kind is object else np.nan, kind)
             for name, kind in kinds.items()
         }
         self.places: Ids | None = None  # of the levels that the batch is cut down to
@@ -62,10 +61,10 @@ class Found(NamedTuple):
 
 
 class Ledger:
-    """Levels that K students have not done with, in the order in which they were proposed.
+    """Levels that a student has not done with, in the order in which they were proposed.
 
-    Ids count the levels from 0 on; one id stands for the levels of all K students at a place. What
-    comes back in any order, in parts or never is observed in the order of the ids.
+    Ids count the levels from 0 on. Results come back in any order, in parts or never, and are
+    observed in the order of the ids.
 
     Args:
         kinds: types of the results that are noted of a level, by name: ``float`` or ``object``.
@@ -84,7 +83,7 @@ class Ledger:
     @property
     def out(self) -> int:
         """The number of ids that are out."""
-        return sum(int((block.state[0] == OUT).sum()) for block in self.blocks)
+        return sum(int((block.state == OUT).sum()) for block in self.blocks)
 
     def add(self, batch: Batch) -> Block:
         """Numbers the levels of a batch, which wait from now on."""
@@ -104,7 +103,7 @@ class Ledger:
         states = np.where((ids >= 0) & (ids < self.next), OVER, WAITING).astype(np.uint8)
         for block in self.blocks:
             inside = (ids >= block.start) & (ids < block.end)
-            states[inside] = block.state[0, ids[inside] - block.start]
+            states[inside] = block.state[ids[inside] - block.start]
         return states
 
     def find(self, ids: Ids) -> list[Found]:
@@ -121,7 +120,7 @@ class Ledger:
                 self._refuse(int(ids[which[0]]), OVER)
             block = self.blocks[each - 1]
             place = ids[which] - block.start
-            states = block.state[0].take(place, mode="clip")
+            states = block.state.take(place, mode="clip")
             states[place >= block.end - block.start] = OVER  # what is between blocks is over
             wrong = np.flatnonzero(states != OUT)
             if len(wrong):
@@ -133,52 +132,52 @@ class Ledger:
             raise ArgumentError(f"ids={twice[0]}: is there more than once")
         return parts
 
-    def hand_out(self, id: int, student: int) -> Levels:
-        """Returns the level of a student that waits under an id, [], which is out from now on."""
+    def hand_out(self, id: int) -> Levels:
+        """Returns the level that waits under an id, [], which is out from now on."""
         block = self.block_of(id)
         assert block is not None  # which are kept until they are over
-        block.state[student, id - block.start] = OUT
-        return block.levels[student, id - block.start]
+        block.state[id - block.start] = OUT
+        return block.levels[id - block.start]
 
     def tell(self, parts: list[Found], results: Mapping[str, NDArray[Any]]) -> None:
-        """Notes results [K, n] of ids [n] that were found."""
+        """Notes results [n] of ids [n] that were found."""
         for block, which, place in parts:
             for name, result in results.items():
-                block.results[name][:, place] = result[:, which]
-            block.state[:, place] = RETURNED
+                block.results[name][place] = result[which]
+            block.state[place] = RETURNED
         self.returned = True
 
-    def tell_one(self, id: int, results: Mapping[str, Any], student: int = 0) -> None:
-        """Notes the results of one level of one student.
+    def tell_one(self, id: int, results: Mapping[str, Any]) -> None:
+        """Notes the results of one level.
 
         Raises:
             ArgumentError: if it is not out.
         """
         block = self.block_of(id)
         place = 0 if block is None else id - block.start
-        if block is None or block.state[student, place] != OUT:
+        if block is None or block.state[place] != OUT:
             self.find(np.array([id]))  # says what is wrong with it
         assert block is not None
         for name, result in results.items():
-            block.results[name][student, place] = result
-        block.state[student, place] = RETURNED
+            block.results[name][place] = result
+        block.state[place] = RETURNED
         self.returned = True
 
     def drop(self, parts: list[Found]) -> None:
         """Notes that nothing more comes of ids that were found."""
         for block, _, place in parts:
-            block.state[:, place] = OVER
+            block.state[place] = OVER
 
-    def is_out(self, id: int, student: int) -> bool:
-        """Returns whether a level of a student is out."""
+    def is_out(self, id: int) -> bool:
+        """Returns whether a level is out."""
         block = self.block_of(id)
-        return block is not None and bool(block.state[student, id - block.start] == OUT)
+        return block is not None and bool(block.state[id - block.start] == OUT)
 
-    def drop_one(self, id: int, student: int) -> None:
-        """Notes that nothing comes of a level of one student, if nothing has."""
+    def drop_one(self, id: int) -> None:
+        """Notes that nothing comes of a level, if nothing has."""
         block = self.block_of(id)
-        if block is not None and block.state[student, id - block.start] <= OUT:
-            block.state[student, id - block.start] = OVER
+        if block is not None and block.state[id - block.start] <= OUT:
+            block.state[id - block.start] = OVER
 
     def drop_all(self) -> None:
         """Notes that nothing more comes of any that is out."""
@@ -190,31 +189,30 @@ class Ledger:
 
         Args:
             settled: whether a block is taken only when none of its levels waits. Its batch is then
-                cut down to those levels that no student has dropped, as if they alone had been
-                proposed.
+                cut down to those levels that were not dropped, as if they alone had been proposed.
 
         Yields:
-            A part of a batch [K, m], and its results [K, m] by name.
+            A part of a batch [m], and its results [m] by name.
         """
         for block in self.blocks if self.returned or settled else ():
             state = block.state
             if settled and (state == WAITING).any():
                 continue
             if settled and block.places is None:
-                block.places = np.flatnonzero((state != OVER).all(0))
-                kept = torch.from_numpy(block.places).expand(len(state), -1)
-                block.batch = block.batch.keep(kept)
-            ready = np.flatnonzero((state == RETURNED).all(0))
+                block.places = np.flatnonzero(state != OVER)
+                some = block.batch[torch.from_numpy(block.places)]
+                block.batch = Batch(some.levels, some.notes)
+            ready = np.flatnonzero(state == RETURNED)
             if not len(ready):
                 continue
             part = ready if block.places is None else block.places.searchsorted(ready)
-            whole = len(part) == block.batch.count
-            batch = block.batch if whole else block.batch[:, torch.from_numpy(part)]
-            yield batch, {name: result[:, ready] for name, result in block.results.items()}
-            state[:, ready] = OVER
+            whole = len(part) == len(block.batch)
+            batch = block.batch if whole else block.batch[torch.from_numpy(part)]
+            yield batch, {name: result[ready] for name, result in block.results.items()}
+            state[ready] = OVER
             for name, kind in self._kinds.items():
                 if kind is object:
-                    block.results[name][:, ready] = None
+                    block.results[name][ready] = None
         self.returned = False
         self.blocks = [b for b in self.blocks if not _is_over(b)]
 
@@ -255,9 +253,9 @@ class Ledger:
         for kept in state["blocks"]:
             levels = moved(of_kind(like, kept["levels"]), device_of(like))
             places = kept["places"]
-            some = levels if places is None else levels[:, places]
-            notes: Any = TensorDict.from_dict(dict(kept["notes"]), batch_size=some.shape[:2])
-            block = Block(kept["start"], Batch(levels, TensorDict({}, levels.shape[:2])), {})
+            some = levels if places is None else levels[places]
+            notes: Any = TensorDict.from_dict(dict(kept["notes"]), batch_size=some.shape[:1])
+            block = Block(kept["start"], Batch(levels), {})
             block.batch = Batch(some, notes.clone())
             block.places = None if places is None else places.numpy()
             block.state = kept["state"].numpy().copy()
@@ -271,14 +269,13 @@ class Ledger:
 
 def _is_over(block: Block) -> bool:
     waits = bool((block.state == WAITING).any())
-    return not waits and bool((block.state == OVER).any(0).all())
+    return not waits and bool((block.state == OVER).all())
 
 
 def _saved(result: NDArray[Any]) -> Any:
     if result.dtype != object:
         return torch.tensor(result)
-    entries = np.ndenumerate(result)
-    return [[*place, packed(entry)] for place, entry in entries if entry is not None]
+    return [[place, packed(entry)] for place, entry in enumerate(result) if entry is not None]
 
 
 def _restored(saved: Any, shape: tuple[int, ...], device: torch.device | None) -> NDArray[Any]:
@@ -286,7 +283,7 @@ def _restored(saved: Any, shape: tuple[int, ...], device: torch.device | None) -
         restored: NDArray[Any] = saved.numpy().copy()
         return restored
     entries = np.full(shape, None, object)
-    for k, place, entry in saved:
+    for place, entry in saved:
         episode: TensorDictBase = TensorDict.from_dict(entry, batch_dims=1)
-        entries[k, place] = episode.to(device)
+        entries[place] = episode.to(device)
     return entries

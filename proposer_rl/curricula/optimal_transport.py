@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -26,14 +25,14 @@ SLACK = 1e-6  # of the reach, where the solver finds nothing at the nearest dist
 
 
 class TransportCurriculum(BinCurriculum):
-    """Draws each student's batch from a distribution that moves towards the target.
+    """Draws batches from a distribution that moves towards the target.
 
     At a scoring pass, the distribution p over the bins becomes the nearest to the target, in the
     2-Wasserstein distance of the space's coordinates, among those that are within epsilon of the
     present one and on bins in which the student's performance is at least delta (Klink et al. 2022,
     "Curriculum Reinforcement Learning via Constrained Optimal Transport", ICML). Where no bin is,
     those of the best performance are taken for it, so that the search begins with what is easiest.
-    A student's first distribution is uniform.
+    The first distribution is uniform.
 
     See :func:`step_towards` for the program, and for what happens when the student forgets.
 
@@ -84,40 +83,35 @@ class TransportCurriculum(BinCurriculum):
         self._target = (target_shares.double() / target_shares.double().sum()).numpy()
         self._costs = squared_distances(space)
 
-    def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
-        """Moves the distributions, each by its own student's performance on the probes."""
-        performance = self._probes.performance(student, streams)
+    def score(self, student: Student, count: int, rng: Streams) -> None:
+        """Moves the distribution by the student's performance on the probes."""
+        performance = self._probes.performance(student, rng)
         allowed = mastered(performance, self._delta)
-        even = torch.full(performance.shape, 1 / performance.shape[-1], dtype=torch.float64)
-        steps = [
-            step_towards(self._target, now, self._costs.numpy(), mask, self._epsilon)
-            for now, mask in zip(
-                self.scores.get("share", even).numpy(), allowed.numpy(), strict=True
-            )
-        ]
-        shares, left = zip(*steps, strict=True)
-        share = torch.from_numpy(np.stack(shares))
+        even = torch.full(performance.shape, 1 / len(performance), dtype=torch.float64)
+        now, costs = self.scores.get("share", even).numpy(), self._costs.numpy()
+        moved, left = step_towards(self._target, now, costs, allowed.numpy(), self._epsilon)
+        share = torch.from_numpy(moved)
         share = share.where(share > NOTHING, 0.0)
         self.scores = {
-            "share": share / share.sum(-1, keepdim=True),
+            "share": share / share.sum(),
             "performance": performance,
             "allowed": allowed,
-            "distance": torch.tensor(left).clamp(min=0).sqrt().unsqueeze(-1),
+            "distance": torch.tensor(left).clamp(min=0).sqrt(),
         }
 
     def shares(self) -> Tensor:
-        """Returns the shares of the bins in the next batch, float [K, N]."""
+        """Returns the shares of the bins in the next batch, float [N]."""
         share = self.scores["share"]
         ahead = torch.from_numpy(self._target) * (self.scores["performance"] < self._delta)
-        part = self._exploration * ahead.sum(-1, keepdim=True)
-        return (1 - part) * share + part / share.shape[-1]
+        part = self._exploration * ahead.sum()
+        return (1 - part) * share + part / len(share)
 
     def log(self) -> dict[str, Any]:
         """Returns also how many bins are allowed, and the distance W2 to the target."""
         record = super().log()
         if record:
-            record["allowed_bins"] = self.scores["allowed"].sum(-1).tolist()
-            record["target_distance"] = self.scores["distance"].squeeze(-1).tolist()
+            record["allowed_bins"] = int(self.scores["allowed"].sum())
+            record["target_distance"] = float(self.scores["distance"])
         return record
 
 
@@ -128,10 +122,10 @@ def squared_distances(space: Space) -> Tensor:
 
 
 def mastered(performance: Tensor, delta: float) -> Tensor:
-    """Returns which bins are mastered, bool [K, N]: where none is, those of the best performance.
+    """Returns which bins are mastered, bool [*B, N]: where none is, those of the best performance.
 
     Args:
-        performance: of each student in each bin, float [K, N].
+        performance: in each bin, float [*B, N].
         delta: least performance of a mastered bin.
     """
     return performance >= performance.amax(-1, keepdim=True).clamp(max=delta)

@@ -1,4 +1,4 @@
-"""Predicts what students would reach on any level, by regression on the levels they trained on.
+"""Predicts what a student would reach on any level, by regression on the levels they trained on.
 
 Every update ends with labelled data, levels and what came of them, that cost nothing more. Of the
 last batches' rows phi_i with outcomes y_i, where what is ``age`` batches old has the weight
@@ -29,7 +29,7 @@ deviation 1 by their weights,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
@@ -39,7 +39,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.batches import device_of, finite, saved
 from proposer_rl.curricula.combinators import Combinator
-from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.contract import Batch, Curriculum, proposed
 from proposer_rl.curricula.student import ABILITIES, Student
 from proposer_rl.settings import Positive, checked
 from proposer_rl.streams import Streams
@@ -63,40 +63,39 @@ PARTS = 10  # of the probabilities from 0 to 1, in which what was predicted is c
 def logistic_ridge(
     features: Tensor, labels: Tensor, weights: Tensor, ridge: float
 ) -> tuple[Tensor, Tensor]:
-    """Fits K logistic regressions by Newton's method; all coefficients are penalised.
+    """Fits a logistic regression by Newton's method; all coefficients are penalised.
 
     Args:
-        features: float64 [K, m, F].
-        labels: in [0, 1], float64 [K, m].
-        weights: of the rows, not negative, float64 [K, m].
+        features: float64 [m, F].
+        labels: in [0, 1], float64 [m].
+        weights: of the rows, not negative, float64 [m].
         ridge: above 0.
 
     Returns:
-        Coefficients beta, float64 [K, F], and their covariance, float64 [K, F, F].
+        Coefficients beta, float64 [F], and their covariance, float64 [F, F].
     """
     prior = ridge * torch.eye(features.shape[-1], dtype=features.dtype)
 
     def at(beta: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns log odds [K, m], and the loss [K]."""
-        z = _times(features, beta)
+        """Returns log odds [m], and the loss []."""
+        z = features @ beta
         misfit = torch.nn.functional.softplus(z) - labels * z
-        return z, (weights * misfit).sum(-1) + ridge / 2 * beta.square().sum(-1)
+        return z, (weights * misfit).sum() + ridge / 2 * beta.square().sum()
 
     def curvature(p: Tensor) -> Tensor:
         return features.mT @ (features * (weights * p * (1 - p)).unsqueeze(-1)) + prior
 
-    beta = features.new_zeros(len(features), features.shape[-1])
+    beta = features.new_zeros(features.shape[-1])
     z, now = at(beta)
     for _ in range(STEPS):
         p = z.sigmoid()
-        slope = _times(features.mT, weights * (p - labels)) + ridge * beta
+        slope = features.mT @ (weights * (p - labels)) + ridge * beta
         step = torch.linalg.solve(curvature(p), slope)
         for halvings in range(HALVINGS + 1):
             z, then = at(beta - step)
-            worse = then > now
-            if halvings == HALVINGS or not worse.any():
+            if halvings == HALVINGS or not then > now:
                 break
-            step = torch.where(worse.unsqueeze(-1), step / 2, step)
+            step = step / 2
         beta, now = beta - step, then
         if bool((step.abs() < CLOSE).all()):
             break
@@ -104,18 +103,18 @@ def logistic_ridge(
 
 
 def linear_ridge(features: Tensor, values: Tensor, weights: Tensor, ridge: float) -> Tensor:
-    """Fits K linear regressions to values float64 [K, m], with the rest as in logistic_ridge.
+    """Fits a linear regression to values float64 [m], with the rest as in logistic_ridge.
 
     Returns:
-        Coefficients, float64 [K, F], all of which are penalised.
+        Coefficients, float64 [F], all of which are penalised.
     """
-    weighted = features.mT * weights.unsqueeze(1)
+    weighted = features.mT * weights
     prior = ridge * torch.eye(features.shape[-1], dtype=features.dtype)
-    return torch.linalg.solve(weighted @ features + prior, _times(weighted, values))
+    return torch.linalg.solve(weighted @ features + prior, weighted @ values)
 
 
 class OutcomeModel:
-    """Predicts what K students would reach on levels, from the outcomes of the last batches.
+    """Predicts what a student would reach on levels, from the outcomes of the last batches.
 
     Args:
         labels: what the probability is of: ``"success"``, as outcomes have it; or
@@ -136,52 +135,52 @@ class OutcomeModel:
         # Outcomes do not always have an entry that nobody needs.
         self.required_results = ("return", "success") if labels == "success" else ("return",)
         self._batches: list[dict[str, Tensor]] = []
-        self._worst = torch.tensor(torch.inf, dtype=torch.float64)  # [K, 1], once there is a row
+        self._worst = torch.tensor(torch.inf, dtype=torch.float64)
         self._fitted: _Fitted | None = None
 
     def add(self, features: Tensor, outcome: Mapping[str, Tensor], *, as_old: bool = False) -> None:
         """Adds a batch to the data.
 
         Args:
-            features: float64 [K, m, F]; a constant one is a further intercept.
-            outcome: what it ``required_results`` names, float64 [K, m].
+            features: float64 [m, F]; a constant one is a further intercept.
+            outcome: what it ``required_results`` names, float64 [m].
             as_old: whether it is as old as the batch before it, and a part of that.
         """
         batch = {"features": features, **{name: outcome[name] for name in self.required_results}}
         if as_old:
             *self._batches, before = self._batches
-            batch = {name: torch.cat([before[name], batch[name]], 1) for name in batch}
+            batch = {name: torch.cat([before[name], batch[name]]) for name in batch}
         self._batches = [*self._batches, batch][-round(KEPT * self._half_life) :]
-        self._worst = torch.minimum(self._worst, outcome["return"].amin(1, keepdim=True))
+        self._worst = torch.minimum(self._worst, outcome["return"].amin())
         self._fitted = None
 
     def predict(self, features: Tensor) -> TensorDict:
-        """Predicts the outcome of levels with features float64 [K, n, F]: a tensordict [K, n].
+        """Predicts the outcome of levels with features float64 [n, F]: a tensordict [n].
 
         ``success`` and ``return``, each float64. Before there is any row they are 0.5 and 0
         everywhere.
         """
-        shape = features.shape[:2]
+        shape = features.shape[:1]
         if not self._batches:
             same = {"success": 0.5, "return": 0.0}
             return TensorDict({k: features.new_full(shape, v) for k, v in same.items()}, shape)
         self._fitted = fitted = self._fitted or self._fit()
         phi = torch.cat([torch.zeros_like(features[..., :1]), features], -1)  # of age 0
-        z = _times(phi, fitted.beta)
+        z = phi @ fitted.beta
         variance = ((phi @ fitted.covariance) * phi).sum(-1)
         return TensorDict(
             {
                 "success": (z / (1 + math.pi / 8 * variance).sqrt()).sigmoid(),
-                "return": fitted.middle + fitted.unit * _times(phi, fitted.mean),
+                "return": fitted.middle + fitted.unit * (phi @ fitted.mean),
             },
             shape,
         )
 
     def labels(self, outcome: Mapping[str, Tensor]) -> Tensor:
-        """Returns the labels in [0, 1] that the model takes from an outcome: float64 [K, m]."""
+        """Returns the labels in [0, 1] that the model takes from an outcome: float64 [m]."""
         if self._labels == "success":
             return outcome["success"]
-        worst = torch.minimum(self._worst, outcome["return"].amin(1, keepdim=True))
+        worst = torch.minimum(self._worst, outcome["return"].amin())
         return (outcome["return"] > worst + EQUAL * (1 + worst.abs())).double()
 
     def state_dict(self) -> dict[str, Any]:
@@ -195,20 +194,19 @@ class OutcomeModel:
 
     def _fit(self) -> _Fitted:
         entries = {
-            name: torch.cat([batch[name] for batch in self._batches], 1)
+            name: torch.cat([batch[name] for batch in self._batches])
             for name in ("features", *self.required_results)
         }
         ages = torch.cat(
             [
                 torch.full_like(batch["return"], (len(self._batches) - number) / self._half_life)
                 for number, batch in enumerate(self._batches, 1)
-            ],
-            1,
+            ]
         )
         weights = 0.5**ages
-        share = weights / weights.sum(1, keepdim=True)
-        middle = (share * entries["return"]).sum(1, keepdim=True)
-        unit = (share * (entries["return"] - middle).square()).sum(1, keepdim=True).sqrt()
+        share = weights / weights.sum()
+        middle = (share * entries["return"]).sum()
+        unit = (share * (entries["return"] - middle).square()).sum().sqrt()
         unit = unit.where(unit > EQUAL * (1 + middle.abs()), 1.0)  # returns that are all alike
         phi = torch.cat([-ages.unsqueeze(-1), entries["features"]], -1)
         returns = (entries["return"] - middle) / unit
@@ -235,7 +233,7 @@ class Modelled(Combinator):
         labels, ridge, half_life: see the model.
     """
 
-    state = ("_model", "_inbox", "_seen", "_has_taken")
+    state = ("_model", "_seen", "_has_observed")
 
     @checked
     def __init__(
@@ -253,49 +251,43 @@ class Modelled(Combinator):
             self.required_results = (*self.required_results, "success")
         self._features, self._labels = features, labels
         self._model = OutcomeModel(labels=labels, ridge=ridge, half_life=half_life)
-        self._inbox = Inbox()
-        self._has_taken = False  # whether anything since the last proposal, as logs make it
+        self._has_observed = False  # whether anything since the last proposal
         self._seen = Predictions()
 
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
+    def propose(self, student: Student, count: int, rng: Streams) -> Batch:
         """Returns what the curriculum proposes, with a student whose performance is predicted."""
-        self._take_in()
-        self._has_taken = False
-        batch = self.parts[0].propose(_answering(student, self._predict), count, streams)
+        self._has_observed = False
+        batch = proposed(self.parts[0], _answering(student, self._predict), count, rng)
         phi = self._phi(batch.levels)
         predicted = self._model.predict(phi)["success"]
-        return self._inbox.batch(batch.levels, features=phi, predicted=predicted, notes=batch.notes)
+        notes = {"features": phi, "predicted": predicted, "notes": batch.notes}
+        return Batch(batch.levels, TensorDict(notes, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Keeps the outcome for the model, and passes it on to the curriculum."""
-        self._inbox.check(batch, outcome)
-        reached = {name: outcome[name].double() for name in self._model.required_results}
-        self.parts[0].observe(student, Batch(batch.levels, batch.notes["notes"]), outcome)
-        self._inbox.put(batch, **batch.notes.select("features", "predicted"), **reached)
+        """Adds the outcome to the model's data, and passes it on to the curriculum.
 
-    def improve(self, student: Student, streams: Sequence[Streams]) -> dict[str, Any]:
+        All that is observed between two proposals counts as one batch.
+        """
+        notes = batch.notes
+        reached = {name: outcome[name].double().cpu() for name in self._model.required_results}
+        self.parts[0].observe(student, Batch(batch.levels, notes["notes"], batch.size), outcome)
+        self._seen.add(notes["predicted"], self._model.labels(reached))
+        self._model.add(notes["features"], reached, as_old=self._has_observed)
+        self._has_observed = True
+
+    def improve(self, student: Student, rng: Streams) -> dict[str, Any]:
         """Improves the curriculum, with a student whose performance the model predicts."""
-        return super().improve(_answering(student, self._predict), streams)
+        return super().improve(_answering(student, self._predict), rng)
 
     def log(self) -> dict[str, Any]:
         """Returns also how right the model was, as :func:`calibration`."""
-        self._take_in()
         return super().log() | self._seen.log()
-
-    def _take_in(self) -> None:
-        """Adds the outcomes since the last proposal to the model's data as one batch."""
-        if not (taken := self._inbox.take()):
-            return
-        evidence: Any = torch.cat(taken, 1)
-        self._seen.add(evidence["predicted"], self._model.labels(evidence))
-        self._model.add(evidence["features"], evidence, as_old=self._has_taken)
-        self._has_taken = True
 
     def _predict(self, levels: Levels) -> TensorDict:
         return self._model.predict(self._phi(levels)).to(device_of(levels))
 
     def _phi(self, levels: Levels) -> Tensor:
-        return finite("features", self._features(levels))
+        return finite("features", self._features(levels.unsqueeze(0))[0])
 
 
 class Predictions:
@@ -305,13 +297,13 @@ class Predictions:
         self._seen: list[list[Tensor]] = []
 
     def add(self, predicted: Tensor, label: Tensor) -> None:
-        """Adds probabilities and labels of a batch, float64 [K, m] each."""
+        """Adds probabilities and labels of a batch, float64 [m] each."""
         self._seen = [*self._seen[1 - LOGGED :], [predicted, label]]
 
     def log(self) -> dict[str, Any]:
         """Returns their :func:`calibration`, or nothing, and begins anew."""
         seen, self._seen = self._seen, []
-        return calibration(*(torch.cat(one, 1) for one in zip(*seen, strict=True))) if seen else {}
+        return calibration(*(torch.cat(one) for one in zip(*seen, strict=True))) if seen else {}
 
     def state_dict(self) -> dict[str, Any]:
         """Returns what was added since the last log."""
@@ -327,22 +319,21 @@ def calibration(predicted: Tensor, label: Tensor) -> dict[str, Any]:
 
     ``brier``, the mean squared error of the predicted probabilities, and ``brier_constant``, that
     of one number for all; ``reliability``, for each tenth of the probabilities how many were
-    predicted there, their mean, and the mean of what it was; of each student.
+    predicted there, their mean, and the mean of what it was.
 
     Args:
-        predicted: probabilities float64 [K, m].
-        label: in [0, 1], float64 [K, m].
+        predicted: probabilities float64 [m].
+        label: in [0, 1], float64 [m].
     """
     part = (predicted * PARTS).long().clamp(max=PARTS - 1)
     sums = [
-        torch.zeros(len(part), PARTS, dtype=torch.float64).scatter_add(1, part, values)
+        torch.zeros(PARTS, dtype=torch.float64).scatter_add(0, part, values)
         for values in (torch.ones_like(label), predicted, label)
     ]
     means = [(total / sums[0].clamp(min=1)).tolist() for total in sums[1:]]
-    constant = (label - label.mean(1, keepdim=True)).square().mean(1)
     return {
-        "brier": (predicted - label).square().mean(1).tolist(),
-        "brier_constant": constant.tolist(),
+        "brier": float((predicted - label).square().mean()),
+        "brier_constant": float((label - label.mean()).square().mean()),
         "reliability": {
             "levels": sums[0].long().tolist(),
             "predicted": means[0],
@@ -352,17 +343,13 @@ def calibration(predicted: Tensor, label: Tensor) -> dict[str, Any]:
 
 
 class _Fitted(NamedTuple):
-    """The coefficients of fitted regressions, and the mean and deviation of returns [K, 1]."""
+    """The coefficients of fitted regressions, and the mean and deviation of returns."""
 
     beta: Tensor
     covariance: Tensor
     middle: Tensor
     unit: Tensor
     mean: Tensor
-
-
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
 def _answering(student: Student, predict: Callable[[Levels], TensorDict]) -> Student:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import torch
 from annotated_types import Interval
 from torch import Tensor
 
+from proposer_rl.curricula.batches import levels_in
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels, Space, refuse_many_bins, refuse_unfit_bins
@@ -60,12 +61,13 @@ class Points:
         differ = places.amax(0) > places.amin(0)
         return (differ | (not self._rounded)).nonzero().flatten()
 
-    def levels(self, points: Tensor, streams: Sequence[Streams]) -> tuple[Levels, Tensor]:
-        """Returns the levels [K, n] at points float64 [K, n, D], and their bins, int64 [K, n]."""
-        bins = self._nearest(points.flatten(0, 1)).view(points.shape[:2])
-        draws = [s.generator("levels") for s in streams]
+    def levels(self, points: Tensor, rng: Streams) -> tuple[Levels, Tensor]:
+        """Returns the levels [n] at points float64 [n, D], and their bins, int64 [n]."""
+        bins, draw = self._nearest(points), rng.generator("levels")
         space: Any = self._space  # only one of continuous parameters has a method `at`
-        return space.generate(bins, draws) if self._rounded else space.at(points, draws), bins
+        if self._rounded:
+            return levels_in(space, bins, draw), bins
+        return space.at(points.unsqueeze(0), [draw])[0], bins
 
     def _nearest(self, points: Tensor) -> Tensor:
         """Returns the bins nearest to points float64 [m, D], int64 [m]."""
@@ -77,7 +79,7 @@ class Points:
         return bins
 
     def tasks(self, points: Tensor, bins: Tensor) -> Tensor:
-        """Returns where the levels at points float64 [K, n, D] lie, float64 [K, n, D]."""
+        """Returns where the levels at points float64 [n, D] lie, float64 [n, D]."""
         return self._space.coordinates.double()[bins] if self._rounded else points
 
     def at(self, start: Mapping[str, float] | None) -> Tensor:

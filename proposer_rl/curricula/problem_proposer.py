@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any, ClassVar
 
@@ -12,18 +12,18 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 
-from proposer_rl.curricula.batches import device_of
+from proposer_rl.curricula.batches import device_of, levels_in
 from proposer_rl.curricula.bins import along_axes, counts_of_bins
-from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.contract import Batch, Curriculum
 from proposer_rl.curricula.proposer import learnt_proposer
 from proposer_rl.curricula.student import Student, TaskStudent
-from proposer_rl.learning import PPOSettings, load_agent, located
+from proposer_rl.learning import PPO, PPOSettings, load_agent, located
 from proposer_rl.learning.objective import require_finite
 from proposer_rl.meta.first_order import TargetMeasure
 from proposer_rl.models import ActorCritic, draw_at
 from proposer_rl.settings import Count, Positive, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import Distribution, Levels, Space, refuse_unfit_bins
+from proposer_rl.task import Distribution, Levels, Space, Task, refuse_unfit_bins
 
 
 class ProblemProposer(Curriculum):
@@ -48,7 +48,7 @@ class ProblemProposer(Curriculum):
     """
 
     needs: tuple[str, ...] = ("probe",)
-    state: ClassVar[tuple[str, ...]] = ("_metrics", "_counts", "_inbox")
+    state: ClassVar[tuple[str, ...]] = ("_metrics", "_counts")
 
     def __init__(
         self,
@@ -76,38 +76,36 @@ class ProblemProposer(Curriculum):
         self._adam = torch.optim.Adam(
             self._parameters, lr=settings.learning_rate, eps=settings.adam_eps
         )
-        self._inbox = Inbox()
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._metrics: dict[str, float] = {}
 
     @abstractmethod
     def reward(
-        self, student: Student, levels: Levels, stream: Streams
+        self, student: Student, levels: Levels, rng: Streams
     ) -> tuple[Tensor, dict[str, float]]:
-        """Returns the rewards of levels [1, E], float [1, E], and metrics."""
+        """Returns the rewards of levels [E], float [E], and metrics."""
 
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Draws levels [1, n] from the policy, which learns from them at once.
+    def propose(self, student: Student, count: int, rng: Streams) -> Batch:
+        """Draws levels [n] from the policy, which learns from them at once.
 
         The policy draws P at a time, and learns from all that it drew.
 
         Raises:
-            ValueError: for several students: a Proposer learns from one.
             DivergedError: if an advantage, a loss, a gradient or a weight is not finite.
         """
-        (stream,), agent = streams, self.agent
-        probes = self.target.sample(self._probe_levels, stream.generator("probes"))
+        agent = self.agent
+        probes = self.target.sample(self._probe_levels, rng.generator("probes"))
         with torch.no_grad():
-            seen = TensorDict({"probes": student.probe(probes)}, [1])
+            seen = TensorDict({"probes": student.probe(probes).unsqueeze(0)}, [1])
             policy = agent.distribution(agent(seen.copy()))
             problems = policy.batch_shape[1]
             shape = (-(-count // problems), 1, problems)
-            noise = torch.rand(shape, generator=stream.generator("choices"))
+            noise = torch.rand(shape, generator=rng.generator("choices"))
             choices = draw_at(policy, noise.to(seen["probes"].device))  # [times, 1, P]
             log_prob = policy.log_prob(choices)
-        bins = choices.view(1, -1).cpu()  # [1, times * P]
-        levels = self.space.generate(bins, [stream.generator("levels")])
-        reward, metrics = self.reward(student, levels, stream)
+        bins = choices.flatten().cpu()  # [times * P]
+        levels = levels_in(self.space, bins, rng.generator("levels"))
+        reward, metrics = self.reward(student, levels, rng)
         drawn = {
             agent.action_key: choices,
             agent.log_prob_key: log_prob,
@@ -115,11 +113,10 @@ class ProblemProposer(Curriculum):
         }
         self._learn(seen, TensorDict(drawn, choices.shape))
         self._metrics |= metrics
-        return self._inbox.batch(levels[:, :count], bins=bins[:, :count])
+        return Batch(levels[:count], TensorDict({"bins": bins[:count]}, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Counts the levels that came back."""
-        self._inbox.check(batch, outcome)
         self._counts += counts_of_bins(batch.notes["bins"], self.space)
 
     def log(self) -> dict[str, Any]:
@@ -198,14 +195,14 @@ class FirstOrderProposer(ProblemProposer):
         self._target_levels, self._step, self._measure = target_levels, step, measure
 
     def reward(
-        self, student: Student, levels: Levels, stream: Streams
+        self, student: Student, levels: Levels, rng: Streams
     ) -> tuple[Tensor, dict[str, float]]:
         """Returns the alignment of each level, by evaluations on either side of the student."""
-        target = self.target.sample(self._target_levels, stream.generator("target"))
-        reached, direction = student.target_direction(target.unsqueeze(0), self._measure)
+        target = self.target.sample(self._target_levels, rng.generator("target"))
+        reached, direction = student.target_direction(target, self._measure)
         aligned = student.alignment(direction, levels, self._step)
         return aligned, {
-            "target_performance": float(reached.mean()),
+            "target_performance": float(reached),
             "alignment": float(aligned.mean()),
             "alignment_sd": float(aligned.std(correction=0)),
         }
@@ -221,14 +218,16 @@ class PairedProposer(ProblemProposer):
 
     J is a student's performance, which may be exact; published are the antagonist's best and the
     protagonist's mean episode. The levels are drawn from the space's bins, each rewarded by itself,
-    rather than built cell by cell. The antagonist trains on a batch when all of it has come back,
-    or 32 newer ones have been proposed.
+    rather than built cell by cell. The antagonist trains on the levels that came back, with an
+    update for as many of them as an update takes.
 
     Args:
         space, target, agent, settings, probe_levels: see :class:`ProblemProposer`.
-        antagonist: the second student.
+        task: of the levels.
+        antagonist: PPO of the second student.
     """
 
+    state = (*ProblemProposer.state, "_levels", "_seeds")
     needs = ("probe", "performance")
 
     def __init__(
@@ -238,35 +237,32 @@ class PairedProposer(ProblemProposer):
         agent: ActorCritic,
         settings: PPOSettings,
         *,
-        antagonist: TaskStudent,
+        task: Task,
+        antagonist: PPO,
         probe_levels: int = 16,
     ) -> None:
         super().__init__(space, target, agent, settings, probe_levels=probe_levels)
-        self.antagonist = antagonist
-        self._inbox = Inbox(target.sample(1, torch.Generator())[0])
+        self.antagonist, self._learner = TaskStudent(task, antagonist), antagonist
+        # Levels [m] that the antagonist is to train on, and the seeds of its actions there.
+        self._levels: Levels = target.sample(1, torch.Generator())[:0]
+        self._seeds: list[int] = []
 
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Lets the antagonist train on the levels that came back, and draws levels [1, n].
-
-        Raises:
-            ValueError: for several students.
-            DivergedError: if a number of the antagonist is not finite.
-        """
-        self._train_antagonist()
-        batch = super().propose(student, count, streams)
-        seed = streams[0].generator("antagonist").initial_seed()  # of its actions on these levels
-        batch.notes["seed"] = torch.full(batch.notes.batch_size, seed)
+    def propose(self, student: Student, count: int, rng: Streams) -> Batch:
+        """Draws levels [n] from the policy, which learns from them at once."""
+        batch = super().propose(student, count, rng)
+        seed = rng.generator("antagonist").initial_seed()  # of its actions on these levels
+        batch.notes["seed"] = torch.full((count,), seed)
         return batch
 
     def reward(
-        self, student: Student, levels: Levels, stream: Streams
+        self, student: Student, levels: Levels, rng: Streams
     ) -> tuple[Tensor, dict[str, float]]:
         """Returns the regret of each level."""
         antagonist, protagonist = (
-            each.performance(levels, stream.generator("regret"))["return"]
+            each.performance(levels, rng.generator("regret"))["return"]
             for each in (self.antagonist, student)
         )
-        student.spend(evaluations=levels.shape[1])  # of the antagonist
+        student.spend(evaluations=len(levels))  # of the antagonist
         regret = (antagonist - protagonist).clamp_min(0)
         return regret, {
             "regret": float(regret.mean()),
@@ -274,27 +270,29 @@ class PairedProposer(ProblemProposer):
         }
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Puts the levels aside for the antagonist, which takes as many steps on them."""
+        """Lets the antagonist take as many steps on the levels.
+
+        Raises:
+            DivergedError: if a number of the antagonist is not finite.
+        """
         super().observe(student, batch, outcome)
-        student.spend(frames=int(outcome["steps"][0].sum()))
-        self._inbox.put(batch, level=batch.levels, seed=batch.notes["seed"])
-
-    def log(self) -> dict[str, Any]:
-        """Returns metrics and counts, when the antagonist has trained."""
-        self._train_antagonist()
-        return super().log()
-
-    def _train_antagonist(self) -> None:
-        """Trains the antagonist on the batches that are complete."""
-        for evidence in self._inbox.take(whole=True):
-            generator = torch.Generator().manual_seed(int(evidence["seed"][0, 0]))
-            self.antagonist.train(evidence["level"], [generator])
+        student.spend(frames=int(outcome["steps"].sum()))
+        self._levels = torch.cat([self._levels, batch.levels])
+        self._seeds += batch.notes["seed"].tolist()
+        size = self._learner.env.batch_size[1]
+        while len(self._seeds) >= size:
+            levels, self._levels = self._levels[:size], self._levels[size:]
+            generator = torch.Generator().manual_seed(self._seeds[0])
+            del self._seeds[:size]
+            self._learner.env.set_levels(levels.unsqueeze(0))
+            self._learner.update([generator])
+            self._learner.check()
 
     def state_dict(self) -> dict[str, Any]:
         """Returns also the antagonist."""
-        return {**super().state_dict(), "antagonist": self.antagonist.snapshot().to_dict()}
+        return super().state_dict() | {"antagonist": self._learner.snapshot().to_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Puts back what :meth:`state_dict` returned."""
         super().load_state_dict(state)
-        self.antagonist.restore(TensorDict(state["antagonist"], [1]))
+        self._learner.restore(TensorDict(state["antagonist"], [1]))

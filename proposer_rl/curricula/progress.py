@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.bins import BinCurriculum, Measure, Probes, means_of_bins
-from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import Count, Decay, Share, checked
 from proposer_rl.streams import Streams
@@ -20,7 +18,7 @@ Q = 0.1  # the success that is stretched to one half
 
 
 class LearningProgressCurriculum(BinCurriculum):
-    """Draws each student's batch from bins by their bidirectional learning progress.
+    """Draws batches from bins by their bidirectional learning progress.
 
     With p the student's success in a bin at a scoring pass, f and s a fast and a slow average of it
     and g the function :func:`stretched`,
@@ -68,14 +66,14 @@ class LearningProgressCurriculum(BinCurriculum):
         probed = probes if source == "exact" else 0
         self._source, self._probes = source, Probes(space, probed, measure)
         self._fast, self._slow, self._exploration = fast, slow, exploration
-        # Sum and number of what came of each bin since the last scoring pass, [K, N].
+        # Sum and number of what came of each bin since the last scoring pass, [N].
         self._episodes: list[Tensor] = []
 
-    def score(self, student: Student, count: int, streams: Sequence[Streams]) -> None:
+    def score(self, student: Student, count: int, rng: Streams) -> None:
         """Moves the averages by the performance on the probes, or in the episodes since."""
-        seen = torch.full((len(streams), self.space.size), torch.nan)  # where nothing was
+        seen = torch.full((self.space.size,), torch.nan)  # where nothing was
         if self._source == "exact":
-            seen = self._probes.performance(student, streams)
+            seen = self._probes.performance(student, rng)
         elif self._episodes:
             seen = self._episodes[0] / self._episodes[1]
         self._episodes = []
@@ -95,24 +93,18 @@ class LearningProgressCurriculum(BinCurriculum):
             "slow": slow,
         }
 
-    def evidence(
-        self, student: Student, batch: Batch, outcome: TensorDictBase
-    ) -> dict[str, Tensor]:
-        """Returns what the episodes reached, if progress is measured by them."""
-        measure = self._probes.measure
+    def learn(self, bins: Tensor, outcome: TensorDictBase) -> None:
+        """Adds what episodes reached to the sums of their bins, if progress is measured by it."""
         if self._source == "exact":
-            return {}
-        return {"reached": outcome[measure].float().cpu()}
-
-    def learn(self, evidence: TensorDict) -> None:
-        """Adds what episodes reached to the sums of their bins."""
-        means, counts = means_of_bins(evidence["bins"], evidence["reached"], self.space.size)
+            return
+        reached = outcome[self._probes.measure].float().cpu()
+        means, counts = means_of_bins(bins, reached, self.space.size)
         totals = [(means * counts).nan_to_num(0.0), counts]
         before = self._episodes or [torch.zeros_like(total) for total in totals]
         self._episodes = [one + other for one, other in zip(before, totals, strict=True)]
 
     def shares(self) -> Tensor:
-        """Returns the shares of the bins in the next batch, float [K, N]."""
+        """Returns the shares of the bins in the next batch, float [N]."""
         return progress_shares(self.scores["score"], self._exploration)
 
 
@@ -134,7 +126,7 @@ def stretched(success: Tensor, q: float = Q) -> Tensor:
 
 
 def progress_shares(progress: Tensor, exploration: float) -> Tensor:
-    """Returns shares [K, N] in proportion to progress [K, N], a part of them uniform.
+    """Returns shares [*B, N] in proportion to progress [*B, N], a part of them uniform.
 
     Args:
         progress: not negative.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.bins import along_axes
-from proposer_rl.curricula.contract import Batch, LearnedCurriculum
+from proposer_rl.curricula.contract import LearnedCurriculum
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import PPO, agent_weights, load_agent, located
 from proposer_rl.meta.actions import Actions
@@ -18,6 +18,7 @@ from proposer_rl.meta.env import SolverTrainingEnv, SolverView
 from proposer_rl.meta.replicas import Replicas
 from proposer_rl.models import ActorCritic, draw_at
 from proposer_rl.streams import Streams
+from proposer_rl.task import Levels
 
 
 class ProposerCurriculum(LearnedCurriculum):
@@ -67,26 +68,24 @@ class ProposerCurriculum(LearnedCurriculum):
         self._proposed = 0  # batches of this cycle
         self._action: Tensor | None = None
 
-    def improve(self, student: Student, streams: Sequence[Streams]) -> dict[str, Any]:
+    def improve(self, student: Student, rng: Streams) -> dict[str, Any]:
         """Draws the levels through which the student is seen, and lets the trainer train."""
-        (stream,) = streams
         self._proposed = 0
         if self.trainer is not None:
-            return self.trainer.train(student, stream)
-        self.view.draw_levels(stream)
+            return self.trainer.train(student, rng)
+        self.view.draw_levels(rng)
         return {}
 
     @torch.no_grad()
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Draws levels [1, n] from the Proposer's policy, given what it sees of the student."""
-        (stream,) = streams
+    def propose(self, student: Student, count: int, rng: Streams) -> Levels:
+        """Draws levels [n] from the Proposer's policy, given what it sees of the student."""
         if self._action is None:  # the first batch can come within a cycle
             self._proposed = 0
         if self._action is None or self._proposed % self.action_repeat == 0:
-            self._action = self._act(student, stream)
+            self._action = self._act(student, rng)
         self._proposed += 1
-        levels, _ = self.actions.levels(self._action, count, [stream])
-        return Batch(levels, TensorDict({}, (1, count)))
+        levels, _ = self.actions.levels(self._action, count, [rng])
+        return levels[0]
 
     def learnt(self) -> dict[str, Any]:
         """Returns the Proposer without its optimiser; nothing if it is frozen and not new."""
@@ -118,17 +117,18 @@ class ProposerCurriculum(LearnedCurriculum):
         if self.trainer is not None:
             self.trainer.replicas.close()
 
-    def _act(self, student: Student, stream: Streams) -> Tensor:
+    def _act(self, student: Student, rng: Streams) -> Tensor:
         # A cycle may be longer than the episodes that it learnt in: then another one begins.
         progress = self._proposed % self.meta_episode_length / self.meta_episode_length
         # -1: before all episodes of the replicas, whose numbers begin at 0.
         draws = self.view.streams.generator("evaluation", -1, self._proposed)
-        performance = student.performance(self.view.validation, draws)
-        state = self.view.observation(performance, student.probe(self.view.probes), progress)
+        performance = student.performance(self.view.validation, draws).unsqueeze(0)
+        probes = student.probe(self.view.probes).unsqueeze(0)
+        state = self.view.observation(performance, probes, progress)
         distribution = self.agent.distribution(self.agent(state))
         if self.own_action == "mode":
             return distribution.mode
-        generator = stream.generator("proposals")
+        generator = rng.generator("proposals")
         shape = (1, *distribution.batch_shape[1:], *distribution.event_shape)
         return draw_at(
             distribution, torch.rand(shape, generator=generator).to(self.view.task.device)
@@ -171,10 +171,10 @@ class ProposerTrainer:
             trainer=self,
         )
 
-    def train(self, student: Student, stream: Streams) -> dict[str, Any]:
+    def train(self, student: Student, rng: Streams) -> dict[str, Any]:
         """Trains K replicas of the student for an episode, and the Proposer on their rewards."""
         env = self.env
-        rollout = self.replicas.roll_out(student.snapshot()[0], stream)
+        rollout = self.replicas.roll_out(student.snapshot(), rng)
         with located("the Proposer"):
             training = self.learner.optimise(rollout)
             self.learner.check()

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 
-from proposer_rl.curricula.batches import device_of, fresh_levels, levels_at, of_kind, packed
-from proposer_rl.curricula.contract import Batch, Curriculum
+from proposer_rl.curricula.batches import device_of
+from proposer_rl.curricula.contract import Curriculum
 from proposer_rl.curricula.scores import Scorer
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import DivergedError
@@ -30,10 +28,9 @@ class SamplingCurriculum(Curriculum):
     def __init__(self, distribution: Distribution) -> None:
         self._distribution = distribution
 
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Draws levels [K, n], each student's from its own streams."""
-        levels = fresh_levels(self._distribution, count, streams, "levels")
-        return Batch(levels)
+    def propose(self, student: Student, count: int, rng: Streams) -> Levels:
+        """Draws levels [n]."""
+        return self._distribution.sample(count, rng.generator("levels"))
 
 
 class SelectionCurriculum(Curriculum):
@@ -46,7 +43,7 @@ class SelectionCurriculum(Curriculum):
     Args:
         space: where levels come from.
         scorer: of them.
-        candidates: levels M that are scored for each student.
+        candidates: levels M that are scored.
         keep: of them.
         every: batches between two such selections.
         new: share of a batch that is drawn anew instead, rounded.
@@ -55,7 +52,7 @@ class SelectionCurriculum(Curriculum):
         ArgumentError: if more are to be kept than are scored.
     """
 
-    state = ("scores", "_proposed")
+    state = ("scores", "kept", "_proposed")
 
     @checked
     def __init__(
@@ -71,59 +68,48 @@ class SelectionCurriculum(Curriculum):
         self.needs, self.required_results = scorer.needs, scorer.plays_for
         self._candidates, self._keep, self._every, self._new = candidates, keep, every, new
         self._new_levels, self.scorer = space, scorer
-        self._template = space.sample(1, torch.Generator())[0]
         self._proposed = 0
-        self.kept: Levels = self._template.expand(0, keep)  # [K, keep], by falling score
-        self.scores = torch.zeros(0)  # float64 [K, keep]
+        self.kept: Levels = space.sample(1, torch.Generator())[:0]  # [keep], by falling score
+        self.scores = torch.zeros(0)  # float64 [keep]
 
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Returns levels [K, n]: some of those kept, then new ones.
+    def propose(self, student: Student, count: int, rng: Streams) -> Levels:
+        """Returns levels [n]: some of those kept, then new ones.
 
         Raises:
             DivergedError: if fewer of the candidates have a score than are kept.
         """
         if self._proposed % self._every == 0:
-            self._select(student, streams)
+            self._select(student, rng)
         self._proposed += 1
         fresh = round(self._new * count)
-        draws = [s.generator("choices") for s in streams]
-        which = [torch.randint(self._keep, (count - fresh,), generator=g) for g in draws]
-        levels = levels_at(self.kept, torch.stack(which)).to(device_of(self._template))
+        draw = rng.generator("choices")
+        which = torch.randint(self._keep, (count - fresh,), generator=draw)
+        levels = self.kept[which]
         if fresh:
-            new = fresh_levels(self._new_levels, fresh, streams, "levels")
-            levels = torch.cat([levels, new], 1)
-        return Batch(levels, TensorDict({}, (len(streams), count)))
+            levels = torch.cat([levels, self._new_levels.sample(fresh, rng.generator("levels"))])
+        return levels
 
-    def _select(self, student: Student, streams: Sequence[Streams]) -> None:
+    def _select(self, student: Student, rng: Streams) -> None:
         """Scores new candidates, and keeps the best of them."""
-        levels = fresh_levels(self._new_levels, self._candidates, streams, "candidates")
-        scored = self.scorer(student, levels, streams)
-        known = int(scored.score.isfinite().sum(-1).min())
+        levels = self._new_levels.sample(self._candidates, rng.generator("candidates"))
+        scored = self.scorer(student, levels, rng)
+        known = int(scored.score.isfinite().sum())
         if known < self._keep:
             raise DivergedError(
                 f"on {known} of {self._candidates} candidates did an episode end within a rollout, "
                 f"so that fewer than {self._keep} have a score; longer rollouts (the horizon) may"
             )
-        best = scored.score.sort(dim=-1, descending=True, stable=True)
-        self.scores = best.values[:, : self._keep]
-        self.kept = levels_at(levels.cpu(), best.indices[:, : self._keep])
+        best = scored.score.sort(descending=True, stable=True)
+        self.scores = best.values[: self._keep]
+        self.kept = levels[best.indices[: self._keep].to(device_of(levels))]
 
     def log(self) -> dict[str, Any]:
-        """Returns the scores of what is kept, and the first student's best levels."""
+        """Returns the scores of what is kept, and the best levels."""
         if not len(self.kept):
             return {}
         return {
-            "highest_score": self.scores[:, 0].tolist(),
-            "lowest_kept_score": self.scores[:, -1].tolist(),
-            "mean_score": self.scores.mean(1).tolist(),
-            "levels": {"highest scores": self.kept[0, :SHOWN]},
+            "highest_score": float(self.scores[0]),
+            "lowest_kept_score": float(self.scores[-1]),
+            "mean_score": float(self.scores.mean()),
+            "levels": {"highest scores": self.kept[:SHOWN]},
         }
-
-    def state_dict(self) -> dict[str, Any]:
-        """Returns also the levels that are kept."""
-        return super().state_dict() | {"kept": packed(self.kept)}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned."""
-        super().load_state_dict(state)
-        self.kept = of_kind(self._template, state["kept"])

@@ -1,6 +1,6 @@
 """Scores levels by how much there is to learn there, from episodes or from a student itself.
 
-A score from episodes reads a rollout [K, P, T], of which only episodes count that end in it: it is
+A score from episodes reads a rollout [n, T], of which only episodes count that end in it: it is
 the mean over the steps of each, then the mean over the episodes of a level; minus infinity where
 none ends (``gradient_norm``: over all steps). A score from evaluation asks the student
 instead, and needs no episode.
@@ -61,7 +61,7 @@ from proposer_rl.task import Levels, NoSuccessError
 Source = Literal["episodes", "exact"]
 
 OwnScore = Callable[[Student, TensorDictBase], Tensor]
-"""A score of levels [K, n] by what came of episodes on them: float [K, n].
+"""A score of levels [n] by what came of episodes on them: float [n].
 
 Called with the student, whose ``gamma`` and ``lmbda`` are those of a critic if there is one, and
 the outcome, see :func:`~proposer_rl.curricula.outcome_of`. Higher is more to learn; minus infinity
@@ -70,21 +70,21 @@ where nothing can be said.
 
 ASKS = {"gradient_norm": ("policy_gradient_norms",)}  # of a student, from episodes
 READS = {"learnability": ("success",), "yield": ("success",), "gradient_norm": ("rollout",)}
-AT_ONCE = 1024  # levels of each Solver that are evaluated at once
+AT_ONCE = 1024  # levels that are evaluated at once
 
 STEPWISE: dict[str, Callable[[Student, TensorDictBase, Tensor], Tensor]] = {
     "positive_value_loss": lambda student, rollout, _: advantages(student, rollout).clamp_min(0),
     "l1_value_loss": lambda student, rollout, _: advantages(student, rollout).abs(),
     "max_mc": lambda _, rollout, best: best.unsqueeze(-1) - values(rollout).squeeze(-1).double(),
 }
-"""Scores of every single step of a rollout [K, P, T], float64 and of that shape.
+"""Scores of every single step of a rollout [n, T], float64 and of that shape.
 
-The last argument is R, the highest return ever seen on each level, [K, P].
+The last argument is R, the highest return ever seen on each level, [n].
 """
 
 
 def learnability(student: Student, levels: Levels) -> Tensor:
-    """Returns p (1 - p) of the probability p of success, float [K, n].
+    """Returns p (1 - p) of the probability p of success, float [n].
 
     Raises:
         NoSuccessError: if there is no success.
@@ -107,19 +107,19 @@ EXACT: dict[str, tuple[tuple[str, ...], Callable[[Student, Levels], Tensor]]] = 
     ),
     "gradient_norm": (("gradient_norms",), lambda s, levels: s.gradient_norms(levels)),
 }
-"""The functions that each score needs of a student, and its formula: float [K, n]."""
+"""The functions that each score needs of a student, and its formula: float [n]."""
 
 
 class Episodes(NamedTuple):
-    """The episodes of a rollout [K, P, T] that end in it.
+    """The episodes of a rollout [n, T] that end in it.
 
     Attributes:
-        weight: of every step, float64 [K, P, T]: 1 / (steps of its episode), so that those of an
+        weight: of every step, float64 [n, T]: 1 / (steps of its episode), so that those of an
             episode add up to 1; 0 for steps of an episode that does not end.
-        ended: episodes of each level, int64 [K, P].
-        successes: those of them that were a success, int64 [K, P].
-        total: sum of their undiscounted returns, float64 [K, P].
-        best: the highest of these, float64 [K, P]; minus infinity without episodes.
+        ended: episodes of each level, int64 [n].
+        successes: those of them that were a success, int64 [n].
+        total: sum of their undiscounted returns, float64 [n].
+        best: the highest of these, float64 [n]; minus infinity without episodes.
     """
 
     weight: Tensor
@@ -130,7 +130,7 @@ class Episodes(NamedTuple):
 
 
 def episodes(rollout: TensorDictBase) -> Episodes:
-    """Splits a rollout [K, P, T] into its episodes."""
+    """Splits a rollout [n, T] into its episodes."""
     after = rollout["next"]
     done, reward = (after[key].squeeze(-1) for key in ("done", "reward"))
     ends, reward = done.long(), reward.double()
@@ -153,17 +153,17 @@ class Scored(NamedTuple):
     """Levels' scores, and the highest returns ever seen there.
 
     Attributes:
-        score: float64 [K, P].
-        best: the highest return, float32 [K, P]; minus infinity where no episode was seen.
+        score: float64 [n].
+        best: the highest return, float32 [n]; minus infinity where no episode was seen.
     """
 
     score: Tensor
     best: Tensor
 
 
-def unseen(shape: Sequence[int]) -> Tensor:
-    """Returns the highest return of levels that nobody has played yet."""
-    return torch.full(shape, -torch.inf)
+def unseen(count: int) -> Tensor:
+    """Returns the highest return of levels [n] that nobody has played yet."""
+    return torch.full((count,), -torch.inf)
 
 
 class Scorer:
@@ -217,13 +217,13 @@ class Scorer:
         best: Tensor,
         before: Tensor,
     ) -> Scored:
-        """Scores levels [K, n] by the outcome of training on them.
+        """Scores levels [n] by the outcome of training on them.
 
         Args:
             student: whose critic and discount count.
             outcome: with a ``score``, a ``rollout``, or neither.
             best: see :meth:`of_rollouts`.
-            before: the return of each level when it was trained on before, float [K, n]; minus
+            before: the return of each level when it was trained on before, float [n]; minus
                 infinity where nothing is known.
         """
         if self._own is not None:
@@ -242,12 +242,12 @@ class Scorer:
     def of_rollouts(
         self, student: Student, rollouts: Sequence[TensorDictBase], best: Tensor
     ) -> Scored:
-        """Scores levels [K, n] by rollouts on them, [K, n, T] each.
+        """Scores levels [n] by rollouts on them, [n, T] each.
 
         Args:
             student: whose critic and discount count.
             rollouts: with values, as ``Student.play`` returns them.
-            best: the highest returns seen on these levels before, float [K, n]; minus infinity
+            best: the highest returns seen on these levels before, float [n]; minus infinity
                 where there was none.
         """
         split = [episodes(rollout) for rollout in rollouts]
@@ -279,28 +279,26 @@ class Scorer:
         self,
         student: Student,
         levels: Levels,
-        streams: Sequence[Streams],
+        rng: Streams,
         *purpose: str | int,
         before: Tensor | None = None,
     ) -> Scored:
-        """Scores levels [K, n] that nobody trains on; the student counts the cost.
+        """Scores levels [n] that nobody trains on; the student counts the cost.
 
         Args:
             student: that would be trained.
-            levels: of each.
-            streams: of the present proposal.
+            levels: to be scored.
+            rng: of the present proposal.
             purpose: below which is drawn what actions draw at random.
             before: see :meth:`of_outcome`; None where nothing is known.
         """
-        size = (student.batch_size if self.from_episodes else AT_ONCE) or levels.shape[1]
-        known = (unseen(levels.shape[:2]) if before is None else before).split(size, 1)
+        size = (student.batch_size if self.from_episodes else AT_ONCE) or len(levels)
+        known = (unseen(len(levels)) if before is None else before).split(size)
         scored = []
-        for batch, some in enumerate(levels.split(size, 1)):
+        for batch, some in enumerate(levels.split(size)):
             if self.from_episodes:
                 played = [
-                    student.play(
-                        some, [s.generator("score", *purpose, batch, again) for s in streams]
-                    )
+                    student.play(some, rng.generator("score", *purpose, batch, again))
                     for again in range(self.rollouts)
                 ]
                 scored.append(self._of_played(student, played, known[batch]))
@@ -308,14 +306,14 @@ class Scorer:
                 _, ask = EXACT[self._name]
                 with torch.no_grad():
                     score = ask(student, some).double().cpu()
-                scored.append(Scored(score, unseen(score.shape)))
-        return Scored(*(torch.cat(entries, 1) for entries in zip(*scored, strict=True)))
+                scored.append(Scored(score, unseen(len(score))))
+        return Scored(*(torch.cat(entries) for entries in zip(*scored, strict=True)))
 
     def _of_played(
         self, student: Student, played: Sequence[TensorDictBase], before: Tensor
     ) -> Scored:
-        """Scores levels [K, n] by rollouts or outcomes on them; see :meth:`__call__`."""
-        none, rollouts = unseen(before.shape), "next" in played[0].keys()
+        """Scores levels [n] by rollouts or outcomes on them; see :meth:`__call__`."""
+        none, rollouts = unseen(len(before)), "next" in played[0].keys()
         if self._own is not None:
             outcomes = map(outcome_of, played) if rollouts else played
             each = [self.of_outcome(student, outcome, none, before) for outcome in outcomes]
@@ -323,7 +321,7 @@ class Scorer:
             return Scored(score.mean(0), best.amax(0))
         if rollouts:
             return self.of_rollouts(student, played, none)
-        told: Any = torch.stack([*played]).cpu()  # [rollouts, K, P]
+        told: Any = torch.stack([*played]).cpu()  # [rollouts, n]
         mean = {name: e.mean(0) for name, e in told.items() if e.is_floating_point()}
         mean["episodes"] = told.get("episodes", torch.ones(told.shape)).sum(0)
         outcome, best = TensorDict(mean, told.shape[1:]), told["return"].amax(0)
@@ -340,7 +338,7 @@ class Scorer:
             )
 
     def _by_own(self, student: Student, outcome: TensorDictBase) -> Tensor:
-        """Returns one's own score of an outcome [K, n], float64."""
+        """Returns one's own score of an outcome [n], float64."""
         assert self._own is not None
         score, shape = self._own(student, outcome), outcome.batch_size
         if not isinstance(score, Tensor) or score.shape != shape or bool(score.isnan().any()):
@@ -382,7 +380,7 @@ def _own_score(score: str | OwnScore) -> OwnScore | None:
 
 
 def _of_returns(name: str, outcome: Mapping[str, Tensor], best: Tensor, before: Tensor) -> Scored:
-    """Returns a score of levels [K, n] from returns and success alone; see the module's text."""
+    """Returns a score of levels [n] from returns and success alone; see the module's text."""
     reached = outcome["return"].double()
     success = outcome.get("success", torch.zeros_like(reached)).double()
     value = before.double().where(before.isfinite(), reached)

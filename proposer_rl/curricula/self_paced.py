@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
 from annotated_types import Interval
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
-from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.contract import Batch, Curriculum
 from proposer_rl.curricula.points import Place, Points
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import Count, Positive, checked
@@ -30,7 +30,7 @@ SLACK = 1e-4  # of the constraints, within which a solution is taken
 
 
 class SelfPacedCurriculum(Curriculum):
-    """Draws each student's levels from a Gaussian that moves towards the target's.
+    """Draws levels from a Gaussian that moves towards the target's.
 
     A level is a point of the box [-1, 1]^D that the space's coordinates span, drawn from a normal
     distribution with independent coordinates, those within the box. After every ``episodes``
@@ -56,13 +56,13 @@ class SelfPacedCurriculum(Curriculum):
         rounded: see :class:`~proposer_rl.curricula.points.Points`.
 
     Attributes:
-        means, deviations: of the distributions, float64 [K, D].
+        mean, deviation: of the distribution, float64 [D].
 
     Raises:
         ValueError: for an unknown axis, or a space that has no points.
     """
 
-    state = ("means", "deviations", "_episodes", "_expected", "_counts", "_inbox")
+    state = ("mean", "deviation", "_episodes", "_expected", "_counts")
 
     @checked
     def __init__(
@@ -94,79 +94,56 @@ class SelfPacedCurriculum(Curriculum):
         middle = (shares * places).sum(0)
         spread = (shares * (places - middle).square()).sum(0).sqrt()
         self._target = Gaussian(middle.numpy(), spread.clamp(min=least_deviation).numpy())
-        self._first = self._points.at(start), torch.full_like(middle, deviation)
-        self.means = self.deviations = torch.zeros(0, self._points.size, dtype=torch.float64)
-        # Since the last step: points [K, W, D], their log densities and performance [K, W].
+        self.mean, self.deviation = self._points.at(start), torch.full_like(middle, deviation)
+        # Since the last step: points [m, D], their log densities and performance [m].
         self._episodes: list[dict[str, Tensor]] = []
-        self._expected: list[float] = []  # performance at the last step, of each student
+        self._expected: float | None = None  # performance at the last step
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
-        self._inbox = Inbox()
 
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Draws points from the Gaussians, and returns levels [K, n] there."""
-        if not len(self.means):
-            self.means, self.deviations = (
-                each.expand(len(streams), -1).clone() for each in self._first
-            )
-        self._take_in()
-        shape = (count, self._points.size)
-        draws = [s.generator("choices") for s in streams]
-        shares = torch.stack([torch.rand(shape, generator=g, dtype=torch.float64) for g in draws])
-        means, deviations = self.means.unsqueeze(1), self.deviations.unsqueeze(1)
-        points, log_density = draw_in_box(means, deviations, shares)
-        levels, bins = self._points.levels(points, streams)
-        return self._inbox.batch(levels, bins=bins, points=points, log_density=log_density)
+    def propose(self, student: Student, count: int, rng: Streams) -> Batch:
+        """Draws points from the Gaussian, and returns levels [n] there."""
+        shape = count, self._points.size
+        shares = torch.rand(shape, generator=rng.generator("choices"), dtype=torch.float64)
+        points, log_density = draw_in_box(self.mean, self.deviation, shares)
+        levels, bins = self._points.levels(points, rng)
+        notes = {"bins": bins, "points": points, "log_density": log_density}
+        return Batch(levels, TensorDict(notes, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Keeps what levels came to, for the next step."""
-        self._inbox.check(batch, outcome)
-        reached = outcome[self._measure].double()
+        """Adds episodes, and makes a step where there are enough."""
         self._counts += counts_of_bins(batch.notes["bins"], self.space)
-        self._inbox.put(batch, **batch.notes.select("points", "log_density"), reached=reached)
+        some = {name: batch.notes[name] for name in ("points", "log_density")}
+        self._episodes.append({**some, "reached": outcome[self._measure].double().cpu()})
+        if sum(len(some["reached"]) for some in self._episodes) >= self._every:
+            self._step()
 
     def log(self) -> dict[str, Any]:
-        """Returns counts of levels by bin, the Gaussians, and how far they are from the target."""
-        self._take_in()
-        if not len(self.means):
+        """Returns counts of levels by bin, the Gaussian, and how far it is from the target."""
+        if not bool(self._counts.any()):
             return {}
         counts, self._counts = self._counts, torch.zeros_like(self._counts)
         return {
             "histogram": along_axes(counts, self.space),
-            "means": self.means.tolist(),
-            "deviations": self.deviations.tolist(),
-            "target_divergence": [divergence(now, self._target)[0] for now in self._gaussians()],
-            **({"expected_performance": list(self._expected)} if self._expected else {}),
+            "means": self.mean.tolist(),
+            "deviations": self.deviation.tolist(),
+            "target_divergence": divergence(self._now, self._target)[0],
+            **({} if self._expected is None else {"expected_performance": self._expected}),
         }
 
-    def _gaussians(self) -> list[Gaussian]:
-        each = zip(self.means.numpy(), self.deviations.numpy(), strict=True)
-        return [Gaussian(mean, deviation) for mean, deviation in each]
-
-    def _take_in(self) -> None:
-        """Adds episodes, and makes a step where there are enough."""
-        for evidence in self._inbox.take():
-            names = ("points", "log_density", "reached")
-            self._episodes.append({name: evidence[name] for name in names})
-            if sum(some["reached"].shape[1] for some in self._episodes) >= self._every:
-                self._step()
+    @property
+    def _now(self) -> Gaussian:
+        return Gaussian(self.mean.numpy(), self.deviation.numpy())
 
     def _step(self) -> None:
-        """Moves the Gaussians by the episodes since the last step."""
+        """Moves the Gaussian by the episodes since the last step."""
         points, log_density, reached = (
-            torch.cat([some[name] for some in self._episodes], 1).numpy()
+            torch.cat([some[name] for some in self._episodes]).numpy()
             for name in ("points", "log_density", "reached")
         )
-        found = [
-            step_towards(self._target, now, *own, *self._limits)
-            for now, own in zip(
-                self._gaussians(), zip(points, log_density, reached, strict=True), strict=True
-            )
-        ]
-        self.means, self.deviations = (
-            torch.from_numpy(np.stack([getattr(new, name) for new, _ in found]))
-            for name in ("mean", "deviation")
+        found, self._expected = step_towards(
+            self._target, self._now, points, log_density, reached, *self._limits
         )
-        self._expected = [expected for _, expected in found]
+        self.mean, self.deviation = map(torch.from_numpy, found)
         self._episodes = []
 
 
@@ -182,22 +159,22 @@ class Gaussian(NamedTuple):
     deviation: Floats
 
 
-def draw_in_box(means: Tensor, deviations: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns points of the box [-1, 1]^D drawn from Gaussians, and the logs of their densities.
+def draw_in_box(mean: Tensor, deviation: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns points of the box [-1, 1]^D drawn from a Gaussian, and the logs of their densities.
 
     Args:
-        means: within the box, float64 [K, 1, D].
-        deviations: float64 [K, 1, D].
-        shares: uniform from 0 to 1, float64 [K, n, D].
+        mean: within the box, float64 [D].
+        deviation: float64 [D].
+        shares: uniform from 0 to 1, float64 [n, D].
 
     Returns:
-        Points, float64 [K, n, D], and densities but for one factor, float64 [K, n].
+        Points, float64 [n, D], and densities but for one factor, float64 [n].
     """
-    low, high = (torch.special.ndtr((end - means) / deviations) for end in (-1.0, 1.0))
+    low, high = (torch.special.ndtr((end - mean) / deviation) for end in (-1.0, 1.0))
     z = torch.special.ndtri(low.lerp(high, shares))
-    points = (means + deviations * z).clamp(-1, 1)
-    z = (points - means) / deviations
-    log_density = -z.square() / 2 - deviations.log() - (high - low).log()
+    points = (mean + deviation * z).clamp(-1, 1)
+    z = (points - mean) / deviation
+    log_density = -z.square() / 2 - deviation.log() - (high - low).log()
     return points, log_density.sum(-1)
 
 

@@ -1,6 +1,6 @@
-"""The slots of one student's buffer, changed level by level: NumPy, since a level is a few numbers.
+"""The slots of a buffer, changed level by level: NumPy, since a level is a few numbers.
 
-``numbers`` are the entries of a buffer's row by name, arrays [N] that are changed in place; see
+``numbers`` are the entries of a buffer by name, arrays [N] that are changed in place; see
 :mod:`~proposer_rl.curricula.buffer`. Scores only move the ranks between the old place and the new,
 so that a level costs microseconds and not another sort of all N.
 

@@ -1,4 +1,4 @@
-"""The functions that a curriculum may ask of the students that it proposes to.
+"""The functions that a curriculum may ask of the student that it proposes to.
 
 Most curricula ask for nothing; others name what they need (:attr:`Curriculum.needs`), so that a
 loop of any kind gives that alone, and a student that lacks something is refused before a run
@@ -8,7 +8,7 @@ begins. :class:`TaskStudent` is that of this library, which can do all that its 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from typing import Any, cast
 
@@ -40,11 +40,11 @@ class UnfitStudentError(TypeError):
 
 
 class Student:
-    """K students as a curriculum sees them, and a meter of what it asked of them.
+    """A student as a curriculum sees it, and a meter of what it asked of the student.
 
     What a student can do is a function: given to the constructor, or a method of a subclass. Levels
-    are [K, n] for any n unless it says otherwise, or [E] where all students get the same; results
-    are without gradients. Asking for a function that it lacks raises :class:`UnfitStudentError`.
+    are [n] for any n unless it says otherwise; results are without gradients. Asking for a function
+    that it lacks raises :class:`UnfitStudentError`.
 
     Args:
         gamma, lmbda: discount, and decay of the traces of generalised advantages, by which
@@ -53,8 +53,8 @@ class Student:
         can: functions by their names, such as ``performance=evaluate``.
 
     Attributes:
-        frames: environment steps that each student was played for on a curriculum's account.
-        evaluations: levels on which each was evaluated for it.
+        frames: environment steps that it was played for on the curriculum's account.
+        evaluations: levels on which it was evaluated for it.
 
     Raises:
         ValueError: for a name that is none of these functions'.
@@ -65,42 +65,39 @@ class Student:
         (None, 'it has no probe(levels)')
     """
 
-    play: Callable[[Levels, Sequence[torch.Generator]], TensorDictBase]
-    """A rollout [K, n, T] on at most ``batch_size`` levels, on which nobody is trained.
+    play: Callable[[Levels, torch.Generator], TensorDictBase]
+    """A rollout [n, T] on at most ``batch_size`` levels, on which nobody is trained.
 
-    TorchRL's, with ``state_value`` where a score reads a critic; or only an outcome [K, n], as
-    :func:`~proposer_rl.curricula.outcome_of` describes it. Actions of student k are drawn from the
-    k-th generator.
+    TorchRL's, with ``state_value`` where a score reads a critic; or only an outcome [n], as
+    :func:`~proposer_rl.curricula.outcome_of` describes it. Actions are drawn from the generator.
     """
     performance: Callable[[Levels, torch.Generator], TensorDictBase]
-    """``return`` and, where there is one, ``success`` on each level: a tensordict [K, n].
+    """``return`` and, where there is one, ``success`` on each level: a tensordict [n].
 
     Expectations, or estimates from episodes.
     """
     exact_performance: Callable[[Levels], TensorDictBase]
     """``performance`` where it is exact, so that nothing is drawn."""
     probe: Callable[[Levels], Tensor]
-    """Each student's behaviour on probe levels [C], as a Proposer sees it: float [K, C, ...]."""
+    """The student's behaviour on probe levels [C], as a Proposer sees it: float [C, ...]."""
     optimal_return: Callable[[Levels], Tensor]
-    """The largest expected return that any policy reaches on levels [K, n], float [K, n]."""
+    """The largest expected return that any policy reaches on each level, float [n]."""
     gradient_norms: Callable[[Levels], Tensor]
-    """Squared length of the gradient of the return on each level, float [K, n]."""
+    """Squared length of the gradient of the return on each level, float [n]."""
     policy_gradient_norms: Callable[[TensorDictBase], Tensor]
-    """Squared length of the policy gradient of each level of a rollout [K, n, T], float [K, n]."""
+    """Squared length of the policy gradient of each level of a rollout [n, T], float [n]."""
     target_direction: Callable[[Levels, str], tuple[Tensor, Direction]]
-    """Performance on levels [K, E] of the target, float [K], and what raises it fastest.
+    """Performance on levels [E] of the target, float [], and what raises it fastest.
 
     The second argument is the measure; see :mod:`proposer_rl.meta.first_order`.
     """
     alignment: Callable[[Direction, Levels, float], Tensor]
-    """Slope of the return on each level along a direction of the parameters, float [K, n].
+    """Slope of the return on each level along a direction of the parameters, float [n].
 
     The last argument is the step of the differences, in learning rates.
     """
     snapshot: Callable[[], TensorDict]
-    """All that training changes of the students, batch [K]."""
-    restore: Callable[[TensorDictBase], None]
-    """Puts back what a snapshot [K] holds."""
+    """All that training changes of the student, batch []."""
 
     def __init__(
         self,
@@ -118,7 +115,7 @@ class Student:
             setattr(self, name, function)
 
     def spend(self, *, frames: int = 0, evaluations: int = 0) -> None:
-        """Counts frames and evaluations that were spent on each student's account."""
+        """Counts frames and evaluations that were spent on the curriculum's account."""
         self.frames += frames
         self.evaluations += evaluations
 
@@ -152,14 +149,15 @@ def require(student: Student, needs: Iterable[str], who: str) -> None:
 
 
 class TaskStudent(Student):
-    """Students of a task that train by PPO, which can do all that the task allows.
+    """One of the Solvers of a task that train by PPO, which can do all that the task allows.
 
     Args:
-        task: that evaluates them.
-        learner: of K of them.
+        task: that evaluates it.
+        learner: of K Solvers.
+        replica: its place among them.
     """
 
-    def __init__(self, task: Task, learner: PPO) -> None:
+    def __init__(self, task: Task, learner: PPO, replica: int = 0) -> None:
         numbers = learner.settings
         super().__init__(
             gamma=numbers.gamma,
@@ -167,7 +165,8 @@ class TaskStudent(Student):
             batch_size=learner.env.batch_size[1:].numel(),
             **{name: getattr(self, f"_{name}") for name in ABILITIES},
         )
-        self._task, self._learner = task, learner
+        self._task = task
+        self._learner = learner if learner.copies == 1 else learner.replica(replica)
 
     def lacks(self, name: str) -> str | None:
         """Returns why the task does not allow the function of that name; None if it does."""
@@ -185,88 +184,80 @@ class TaskStudent(Student):
             return f"{task} must define {kinds[name][1]}"
         return None
 
-    def _play(self, levels: Levels, generators: Sequence[torch.Generator]) -> TensorDictBase:
-        count = levels.shape[1]
+    def _play(self, levels: Levels, generator: torch.Generator) -> TensorDictBase:
         env, collector = self._spectators
         env.set_levels(self._filled_up(levels))
-        rollout = collector.collect(list(generators))
-        self.spend(frames=rollout[0].numel())
-        return rollout if count == rollout.shape[1] else rollout[:, :count]
+        rollout = collector.collect([generator])[0]
+        self.spend(frames=rollout.numel())
+        return rollout[: len(levels)]
 
     @torch.no_grad()
     def _performance(self, levels: Levels, generator: torch.Generator) -> TensorDictBase:
-        self.spend(evaluations=levels.shape[-1])
-        return self._task.performance(self._learner.agent, levels, generator)
+        self.spend(evaluations=len(levels))
+        return self._task.performance(self._learner.agent, levels.unsqueeze(0), generator)[0]
 
     def _exact_performance(self, levels: Levels) -> TensorDictBase:
         return self.performance(levels, torch.Generator())
 
     @torch.no_grad()
     def _probe(self, levels: Levels) -> Tensor:
-        return self._task.probe(self._learner.agent, levels)
+        return self._task.probe(self._learner.agent, levels)[0]
 
     def _optimal_return(self, levels: Levels) -> Tensor:
         return cast(OptimalTask, self._task).optimal_return(levels)
 
     def _gradient_norms(self, levels: Levels) -> Tensor:
-        self.spend(evaluations=levels.shape[-1])
-        return self._gradients.of_returns(self._learner, levels)
+        self.spend(evaluations=len(levels))
+        return self._gradients.of_returns(self._learner, levels.unsqueeze(0))[0]
 
     def _policy_gradient_norms(self, rollout: TensorDictBase) -> Tensor:
+        rollout = rollout.unsqueeze(0)
         advantage = advantages(self, rollout).float()
-        return self._gradients.of_rollouts(self._learner, rollout, advantage)
+        return self._gradients.of_rollouts(self._learner, rollout, advantage)[0]
 
     @cached_property
     def _gradients(self) -> LevelGradients:
         return LevelGradients(self._task)
 
     def _target_direction(self, levels: Levels, measure: str) -> tuple[Tensor, Direction]:
-        self.spend(evaluations=levels.shape[-1])
-        return exact_direction(cast(DifferentiableTask, self._task), self._learner, levels, measure)
+        self.spend(evaluations=len(levels))
+        task = cast(DifferentiableTask, self._task)
+        reached, direction = exact_direction(task, self._learner, levels.unsqueeze(0), measure)
+        return reached[0], direction
 
     def _alignment(self, direction: Direction, levels: Levels, step: float) -> Tensor:
-        self.spend(evaluations=2 * levels.shape[-1])
-        return exact_alignment(
-            cast(DifferentiableTask, self._task), self._learner, direction, levels, step
-        )
-
-    def train(self, levels: Levels, generators: Sequence[torch.Generator]) -> None:
-        """Trains on levels [K, n], with an update for each ``batch_size`` of them.
-
-        Raises:
-            DivergedError: if a number is not finite.
-        """
-        for some in levels.split(self._learner.env.batch_size[1:].numel(), 1):
-            self._learner.env.set_levels(self._filled_up(some).to(self._task.device))
-            self._learner.update(list(generators))
-            self._learner.check()
+        self.spend(evaluations=2 * len(levels))
+        task = cast(DifferentiableTask, self._task)
+        return exact_alignment(task, self._learner, direction, levels.unsqueeze(0), step)[0]
 
     def _snapshot(self) -> TensorDict:
-        return self._learner.snapshot()
-
-    def _restore(self, snapshot: TensorDictBase) -> None:
-        self._learner.restore(snapshot)
+        return self._learner.snapshot()[0]
 
     @cached_property
     def _spectators(self) -> tuple[EnvBase, RolloutCollector]:
         return self._task.spectators(self._learner)
 
     def _filled_up(self, levels: Levels) -> Levels:
-        """Repeats the last of levels [K, n], so that there are as many as the environment takes."""
-        size, count = self._learner.env.batch_size[1:].numel(), levels.shape[1]
-        if count == size:
-            return levels
-        if count > size:
-            raise ValueError(f"{count} levels at once; the students' environment takes {size}")
-        return levels[:, torch.arange(size).clamp(max=count - 1)]
+        """Repeats the last of levels [n], so that there are as many as an environment [1, P] takes.
+
+        Returns:
+            [1, P].
+        """
+        assert self.batch_size is not None
+        count = len(levels)
+        if count > self.batch_size:
+            raise ValueError(f"{count} levels at once; the student takes {self.batch_size}")
+        if count < self.batch_size:
+            levels = levels[torch.arange(self.batch_size).clamp(max=count - 1)]
+        return levels.unsqueeze(0)
 
 
 def advantages(student: Student, rollout: TensorDictBase, lmbda: float | None = None) -> Tensor:
-    """Returns generalised advantages A_t, not standardised: float64 [K, n, T].
+    """Returns generalised advantages A_t, not standardised: float64 [*B, n, T].
 
     Args:
         student: whose discount and decay of traces are used.
-        rollout: with ``state_value``, [K, n, T].
+        rollout: with ``state_value``, [*B, n, T].
         lmbda: in place of the student's decay; 0 for the error of one step.
 
     Raises:

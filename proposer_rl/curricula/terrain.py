@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 from math import prod
 from typing import Annotated, Any
 
 import torch
 from annotated_types import Ge
-from tensordict import TensorDictBase
-from torch import Tensor
+from tensordict import TensorDict, TensorDictBase
 
+from proposer_rl.curricula.batches import levels_in
 from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
-from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
+from proposer_rl.curricula.contract import Batch, Curriculum
 from proposer_rl.curricula.points import refuse_crossed
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import ArgumentError, checked
@@ -45,7 +45,7 @@ class RowsCurriculum(Curriculum):
         ArgumentError: for an unknown axis, one of a single row, or ``lower`` above ``upper``.
     """
 
-    state = ("_queue", "_counts", "_last", "_inbox")
+    state = ("_queue", "_counts", "_last")
 
     @checked
     def __init__(
@@ -75,35 +75,27 @@ class RowsCurriculum(Curriculum):
         self.required_results = ("success",) if measure == "success" else ()
         self._lower, self._upper, self._measure = lower, upper, measure
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
-        self._last = torch.zeros(0, dtype=torch.int64)  # rows of the last batch, [K, n]
-        self._queue = torch.zeros(1, 0, dtype=torch.int64)  # rows [K, m] of the next levels
-        self._inbox = Inbox()
+        self._last = torch.zeros(0, dtype=torch.int64)  # rows of the last batch, [n]
+        self._queue = torch.zeros(0, dtype=torch.int64)  # rows [m] of the next levels
 
-    def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
-        """Returns levels [K, n] in the rows that are next."""
-        moved = [evidence["next"] for evidence in self._inbox.take()]
-        queue = torch.cat([self._queue.expand(len(streams), -1), *moved], 1)
-        next_rows, self._queue = queue[:, :count], queue[:, count:]
-        draws = [s.generator("choices") for s in streams]
-
-        def uniform(high: int) -> Tensor:
-            return torch.stack([torch.randint(high, (count,), generator=draw) for draw in draws])
-
+    def propose(self, student: Student, count: int, rng: Streams) -> Batch:
+        """Returns levels [n] in the rows that are next."""
+        next_rows, self._queue = self._queue[:count], self._queue[count:]
+        uniform = partial(torch.randint, size=(count,), generator=rng.generator("choices"))
         first, anywhere = uniform(self._start + 1), uniform(self._rows)
-        rows = torch.cat([next_rows, first[:, next_rows.shape[1] :]], 1)
+        rows = torch.cat([next_rows, first[len(next_rows) :]])
         rows = rows.where(rows < self._rows, anywhere)
         self._last = rows
         bins = (uniform(self._before) * self._rows + rows) * self._after + uniform(self._after)
-        levels = self.space.generate(bins, [s.generator("levels") for s in streams])
-        return self._inbox.batch(levels, bins=bins, row=rows)
+        levels = levels_in(self.space, bins, rng.generator("levels"))
+        return Batch(levels, TensorDict({"bins": bins, "row": rows}, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Keeps the rows that follow, for the next proposal."""
-        self._inbox.check(batch, outcome)
+        """Appends the rows that follow to those that are next."""
         reached = outcome[self._measure].double().cpu()
         move = (reached >= self._upper).long() - (reached < self._lower).long()
         self._counts += counts_of_bins(batch.notes["bins"], self.space)
-        self._inbox.put(batch, next=(batch.notes["row"] + move).clamp(min=0))
+        self._queue = torch.cat([self._queue, (batch.notes["row"] + move).clamp(min=0)])
 
     def log(self) -> dict[str, Any]:
         """Returns counts of levels by bin, and of the last batch the mean row and the last's share.
@@ -115,6 +107,6 @@ class RowsCurriculum(Curriculum):
         counts, self._counts = self._counts, torch.zeros_like(self._counts)
         return {
             "histogram": along_axes(counts, self.space),
-            "mean_row": self._last.double().mean(1).tolist(),
-            "last_row": (self._last == self._rows - 1).double().mean(1).tolist(),
+            "mean_row": float(self._last.double().mean()),
+            "last_row": float((self._last == self._rows - 1).double().mean()),
         }

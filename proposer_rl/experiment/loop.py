@@ -6,20 +6,17 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
+from itertools import chain
 from typing import Annotated, Any
 
+import torch
 from annotated_types import Ge, Gt
 from tensordict import TensorDict
 from tqdm import tqdm
 
-from proposer_rl.curricula import (
-    Curriculum,
-    LearnedCurriculum,
-    TaskStudent,
-    outcome_of,
-    require,
-)
-from proposer_rl.curricula.continued import ContinuedLevels
+from proposer_rl.curricula import Curriculum, LearnedCurriculum, outcome_of
+from proposer_rl.experiment.continued import ContinuedLevels
+from proposer_rl.experiment.side_by_side import SideBySide
 from proposer_rl.experiment.tables import Log, RunTables
 from proposer_rl.learning import PPO, located
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_latest, save_checkpoint
@@ -27,7 +24,7 @@ from proposer_rl.runs.folder import SLACK, RunFolder, can_reach, read_csv
 from proposer_rl.runs.process import Output, Status, StopRequested, StopSignals
 from proposer_rl.settings import ArgumentError, settings
 from proposer_rl.streams import Streams
-from proposer_rl.task import NoSuccessError, Task
+from proposer_rl.task import Task
 
 
 class Experiment:
@@ -36,7 +33,7 @@ class Experiment:
     Args:
         task: which measures and records.
         learner: PPO of a population of K Solvers, one per seed.
-        curriculum: what they train on.
+        curricula: what each of them trains on.
         schedule: lengths and intervals.
         seeds: the K seeds; every draw of copy k is a function of the k-th.
         folder: where the files go; a checkpoint in it is resumed.
@@ -57,7 +54,7 @@ class Experiment:
         self,
         task: Task,
         learner: PPO,
-        curriculum: Curriculum,
+        curricula: Sequence[Curriculum],
         *,
         schedule: ScheduleSettings,
         seeds: Sequence[int],
@@ -70,18 +67,11 @@ class Experiment:
         check_headline(task, schedule)
         self.task = task
         self.learner = learner
-        self.student = TaskStudent(task, learner)
-        require(self.student, curriculum.needs, type(curriculum).__name__)
-        if "success" in curriculum.required_results and "success" not in task.results:
-            raise NoSuccessError(
-                f"{type(curriculum).__name__}: reads success of episodes, and this task tells "
-                "none, only the return"
-            )
-        self.curriculum = curriculum
+        self.sides = SideBySide(task, learner, curricula)
         self._continued: ContinuedLevels | None = None
         if learner.settings.continue_episodes:
-            like = next(iter(task.evaluated_on.values()))
-            self._continued = ContinuedLevels(curriculum, self.student, learner, like)
+            like = next(iter(task.evaluated_on.values()))[0]
+            self._continued = ContinuedLevels(curricula, self.sides.students, learner, like)
         self.schedule = schedule
         self.seeds = list(seeds)
         self.folder = folder
@@ -102,19 +92,22 @@ class Experiment:
         return self._seconds_before + time.monotonic() - self._started
 
     @property
-    def costs(self) -> dict[str, float]:
+    def costs(self) -> list[dict[str, float]]:
         """The costs of each Solver so far, by name.
 
         ``frames``: environment steps of its own training; ``curriculum_frames`` and
-        ``evaluations``: steps, and evaluations of a policy on a level, that the curriculum asked
+        ``evaluations``: steps, and evaluations of a policy on a level, that its curriculum asked
         for; ``seconds`` of the process.
         """
-        return {
-            "frames": self.updates * self.task.batch_size * self.learner.settings.horizon,
-            "curriculum_frames": self.student.frames,
-            "evaluations": self.student.evaluations,
-            "seconds": round(self.seconds, 3),
-        }
+        return [
+            {
+                "frames": self.updates * self.task.batch_size * self.learner.settings.horizon,
+                "curriculum_frames": student.frames,
+                "evaluations": student.evaluations,
+                "seconds": round(self.seconds, 3),
+            }
+            for student in self.sides.students
+        ]
 
     def run(self) -> dict[str, Any]:
         """Trains to the end of the schedule, from the folder's newest checkpoint if it has one.
@@ -180,7 +173,7 @@ class Experiment:
         }
         return {
             "updates": self.updates,
-            **self.costs,
+            **{name: max(own[name] for own in self.costs) for name in self.costs[0]},
             "headline": headline,
             "threshold": threshold,
             # null: censored, the threshold was not reached within ``updates``
@@ -189,35 +182,38 @@ class Experiment:
         }
 
     def _improve(self) -> None:
-        """Begins a cycle: improves the curriculum, and logs the cycle before."""
-        spent = self.student.frames
-        metrics: dict[str, Any] = {}
-        if isinstance(self.curriculum, LearnedCurriculum):
-            metrics = self._improved(self.curriculum)
-        logged = self._log_cycle(metrics)
+        """Begins a cycle: improves the curricula, and logs the cycle before."""
+        spent = [student.frames for student in self.sides.students]
+        logged = self._log_cycle(self._improved())
         self.cycles += 1
         # Improving can be nearly all of a cycle's work, so it is saved at once.
-        self._pause(due=logged or self.student.frames > spent)
+        spends = spent != [student.frames for student in self.sides.students]
+        self._pause(due=logged or spends)
 
-    def _improved(self, curriculum: LearnedCurriculum) -> dict[str, Any]:
+    def _improved(self) -> list[dict[str, Any]]:
         streams = self._streams("cycle", self.cycles)
+        if not any(isinstance(each, LearnedCurriculum) for each in self.sides.curricula):
+            return [{} for _ in streams]
         while True:
             before = deepcopy(self._state())  # improving may change a curriculum's state in place
             try:
                 self._status.tell("improving the curriculum")
-                return curriculum.improve(self.student, streams)
+                return self.sides.improve(streams)
             except StopRequested:
                 self._save(before)
                 self._signals.deliver()
                 # A handler has returned, so the run goes on.
                 self._restore(before)
 
-    def _log_cycle(self, improved: Mapping[str, Any] | None = None) -> bool:
-        """Writes the log of the cycle that has ended, and metrics of its improvement."""
-        metrics = {**self.curriculum.log(), **(improved or {})}
-        if metrics:
+    def _log_cycle(self, improved: Sequence[Mapping[str, Any]] | None = None) -> bool:
+        """Writes the logs of the cycle that has ended, and metrics of its improvement."""
+        logs = [curriculum.log() for curriculum in self.sides.curricula]
+        metrics = [
+            {**log, **own} for log, own in zip(logs, improved or [{}] * len(logs), strict=True)
+        ]
+        if any(metrics):
             self._tables.add_cycle(self.updates, self.cycles, metrics, self.costs)
-        return bool(metrics)
+        return any(metrics)
 
     def _update(self) -> None:
         streams = self._streams("update", self.updates)
@@ -226,20 +222,21 @@ class Experiment:
             update, credits = self._continued.update(streams)
             played = self._continued.shown
         else:
-            batch = self.curriculum.propose(self.student, self.task.batch_size, streams)
-            self.learner.env.set_levels(batch.levels)
+            batches = self.sides.propose(self.task.batch_size, streams)
+            self.learner.env.set_levels(torch.stack([batch.levels for batch in batches]))
             update = self.learner.update([stream.generator("actions") for stream in streams])
             self.learner.check()
-            credits = [(batch, outcome_of(update.rollout))]
-            played = batch.levels, update.rollout
-        for batch, outcome in credits:
-            unscaled = outcome["return"] / self.task.reward_scale  # as performance is told
-            self.curriculum.observe(self.student, batch, outcome.set("return", unscaled))
+            own = list(zip(batches, update.rollout.unbind(0), strict=True))
+            credits = [[(batch, outcome_of(rollout))] for batch, rollout in own]
+            played = [(batch.levels, rollout) for batch, rollout in own]
+        for _, outcome in chain(*credits):
+            outcome["return"] = outcome["return"] / self.task.reward_scale  # as performance is told
+        self.sides.observe(credits)
         self.updates += 1
         last = self.updates == self.schedule.updates
         if last or self.updates % self.schedule.evaluate_every == 0:
             self._measure()
-            self._tables.add_training(self.updates, *played, update.metrics)
+            self._tables.add_training(self.updates, played, update.metrics)
         self._pause(due=last or self.updates % self.schedule.checkpoint_every == 0)
 
     def _measure(self) -> None:
@@ -282,13 +279,11 @@ class Experiment:
         return {
             "updates": self.updates,
             "cycles": self.cycles,
-            "curriculum_frames": self.student.frames,
-            "evaluations": self.student.evaluations,
             "seconds": self.seconds,
             "headline": self._headline,
             "rows": self.folder.lengths(),
             "solver": self.learner.snapshot().to_dict(),
-            "curriculum": self.curriculum.state_dict(),
+            **self.sides.state_dict(),
             **({} if self._continued is None else {"episodes": self._continued.state_dict()}),
         }
 
@@ -312,12 +307,10 @@ class Experiment:
 
     def _restore(self, state: State) -> None:
         self.learner.restore(TensorDict(state["solver"], [len(self.seeds)]))
-        self.curriculum.load_state_dict(dict(state["curriculum"]))
+        self.sides.load_state_dict(state)
         if self._continued is not None:
             self._continued.load_state_dict(state["episodes"])
         self.updates, self.cycles = state["updates"], state["cycles"]
-        self.student.frames = state["curriculum_frames"]
-        self.student.evaluations = state["evaluations"]
         self._seconds_before = state["seconds"]
         self._started = time.monotonic()
         self._headline = [float(value) for value in state["headline"]]

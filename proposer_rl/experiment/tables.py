@@ -6,10 +6,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 
 from proposer_rl.runs.folder import RunFolder, read_table
-from proposer_rl.task import Task
+from proposer_rl.task import Levels, Task
 
 Log = Callable[[str, Mapping[str, Any], int], None]
 """Receives each row of the first copy: its table, its values and its update."""
@@ -28,11 +29,11 @@ class RunTables:
         self._log = log or (lambda table, values, updates: None)
 
     def add_metrics(
-        self, updates: int, measured: TensorDictBase, costs: Mapping[str, float]
+        self, updates: int, measured: TensorDictBase, costs: Sequence[Mapping[str, float]]
     ) -> None:
-        """Writes a row for each of K Solvers: its measurements, [K], and the costs so far."""
-        for seed, values in self._per_copy(measured):
-            self._append("metrics.csv", {"seed": seed, "updates": updates, **costs, **values})
+        """Writes a row for each of K Solvers: its measurements, [K], and its costs so far."""
+        for (seed, values), spent in zip(self._per_copy(measured), costs, strict=True):
+            self._append("metrics.csv", {"seed": seed, "updates": updates, **spent, **values})
 
     def add_levels(self, updates: int, reached: Mapping[str, TensorDictBase]) -> None:
         """Writes each Solver's results on each evaluation level, [K, E] by distribution."""
@@ -43,28 +44,48 @@ class RunTables:
                 self._folder.append("levels.jsonl", row)
 
     def add_training(
-        self, updates: int, levels: Any, rollout: TensorDictBase, metrics: TensorDictBase
+        self,
+        updates: int,
+        played: Sequence[tuple[Levels, TensorDictBase]],
+        metrics: TensorDictBase,
     ) -> None:
-        """Writes PPO's numbers [K] of an update, and a sample of its levels [K, P]."""
-        trained_on = self._task.training_metrics(levels, rollout)
-        for seed, values in self._per_copy(trained_on, metrics):
+        """Writes each Solver's numbers of an update, and a sample of its levels.
+
+        Args:
+            updates: so far.
+            played: of each Solver levels [n] and a rollout [n, T] on them.
+            metrics: PPO's, [K].
+        """
+        numbers = [
+            self._task.training_metrics(levels.unsqueeze(0), rollout.unsqueeze(0))
+            for levels, rollout in played
+        ]
+        for seed, values in self._per_copy(torch.cat(numbers), metrics):
             self._append("training.csv", {"seed": seed, "updates": updates, **values})
         some = slice(RECORDED_LEVELS)
-        for copy, seed in enumerate(self._seeds):
-            sample = self._task.record(levels[copy, some], rollout[copy, some])
+        for seed, (levels, rollout) in zip(self._seeds, played, strict=True):
+            sample = self._task.record(levels[some], rollout[some])
             row = {"updates": updates, "seed": seed, "levels": sample}
             self._folder.append("curriculum.jsonl", row)
 
     def add_cycle(
-        self, updates: int, cycle: int, metrics: Mapping[str, Any], costs: Mapping[str, float]
+        self,
+        updates: int,
+        cycle: int,
+        logs: Sequence[Mapping[str, Any]],
+        costs: Sequence[Mapping[str, float]],
     ) -> None:
-        """Writes a curriculum's log of the cycle that has ended, with its levels recorded."""
-        told = dict(metrics)
-        if "levels" in told:
-            shown = told["levels"].items()
-            told["levels"] = {text: self._task.record(some, None) for text, some in shown}
-        spent = {name: costs[name] for name in ("curriculum_frames", "evaluations")}
-        self._append("cycles.jsonl", {"cycle": cycle, "updates": updates, **spent, **told})
+        """Writes each curriculum's log of the cycle that has ended, with its levels recorded."""
+        for seed, log, spent in zip(self._seeds, logs, costs, strict=True):
+            told = dict(log)
+            if "levels" in told:
+                shown = told["levels"].items()
+                told["levels"] = {text: self._task.record(some, None) for text, some in shown}
+            place: dict[str, Any] = {"cycle": cycle, "updates": updates}
+            if len(self._seeds) > 1:
+                place["seed"] = seed
+            asked = {name: spent[name] for name in ("curriculum_frames", "evaluations")}
+            self._append("cycles.jsonl", {**place, **asked, **told})
 
     def log_again(self, updates: int) -> None:
         """Logs again the rows of the update that a run goes on from.

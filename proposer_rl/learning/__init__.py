@@ -15,6 +15,7 @@ from proposer_rl.learning.objective import SolverSettings as SolverSettings
 from proposer_rl.learning.objective import gae as gae
 from proposer_rl.learning.objective import located as located
 from proposer_rl.learning.ppo import PPO as PPO
+from proposer_rl.learning.ppo import Replica as Replica
 from proposer_rl.learning.ppo import Update as Update
 from proposer_rl.learning.rollout import RolloutCollector as RolloutCollector
 from proposer_rl.learning.rollout import RolloutPolicy as RolloutPolicy

@@ -33,7 +33,7 @@ from proposer_rl.learning.snapshot import (
     take_snapshot,
 )
 from proposer_rl.learning.training_batch import Minibatches, Statistics
-from proposer_rl.models import ActorCritic, Population
+from proposer_rl.models import ActorCritic, Population, one_copy
 
 DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # beside the terms, where a loss has them
 
@@ -282,6 +282,10 @@ class PPO:
         weights = dict(self.agent.named_parameters())
         objective.require_finite(*self._last_training, weights, self.agent.copies, first)
 
+    def replica(self, number: int) -> Replica:
+        """Returns one of K replicas by itself; it changes as this learner trains."""
+        return Replica(self, number)
+
     def snapshot(self) -> TensorDict:
         """Returns a copy of weights and Adam's state, batch [K] with replicas and [] without.
 
@@ -297,3 +301,22 @@ class PPO:
         self.collector.begin_anew()
         self.statistics.discounted = None
         self._gradient_steps = restore_snapshot(self.agent, self._adam, snapshot)
+
+
+class Replica:
+    """One of the K replicas that train side by side, to be evaluated as if it were alone.
+
+    Its agent lies in the memory of theirs.
+
+    Attributes:
+        agent: with one copy, which changes as they are trained.
+        settings: PPO's numbers.
+    """
+
+    def __init__(self, learner: PPO, number: int) -> None:
+        self.agent, self.settings = one_copy(learner.agent, number), learner.settings
+        self._learner, self._number = learner, number
+
+    def snapshot(self) -> TensorDict:
+        """Returns a copy of its weights and Adam's state, batch [1]."""
+        return self._learner.snapshot()[self._number : self._number + 1]

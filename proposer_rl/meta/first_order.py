@@ -50,7 +50,7 @@ from tensordict.utils import expand_as_right
 from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
-from proposer_rl.learning import PPO, DivergedError, agent_values
+from proposer_rl.learning import PPO, DivergedError, Replica, agent_values
 from proposer_rl.meta.rewards import mean_log_success, mean_return
 from proposer_rl.models import ActorCritic
 from proposer_rl.streams import Streams
@@ -94,7 +94,7 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
     return mean
 
 
-def target_direction(learner: PPO, performance: Tensor) -> dict[str, Tensor]:
+def target_direction(learner: PPO | Replica, performance: Tensor) -> dict[str, Tensor]:
     """Returns the target direction of K Solvers, each scaled to a root mean square of 1.
 
     Args:
@@ -110,7 +110,7 @@ def target_direction(learner: PPO, performance: Tensor) -> dict[str, Tensor]:
     return scaled(direction)
 
 
-def in_adams_units(learner: PPO, performance: Tensor) -> dict[str, Tensor]:
+def in_adams_units(learner: PPO | Replica, performance: Tensor) -> dict[str, Tensor]:
     """Returns the gradient of a performance, divided by what Adam divides its step by.
 
     Before Adam's first step there is no second moment, and nothing is divided.
@@ -220,7 +220,7 @@ def alignment(
 
 
 def exact_direction(
-    task: DifferentiableTask, learner: PPO, levels: Levels, measure: str
+    task: DifferentiableTask, learner: PPO | Replica, levels: Levels, measure: str
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Returns R of K Solvers on levels [K, E] of the target, float [K], and their directions.
 
@@ -234,7 +234,11 @@ def exact_direction(
 
 
 def exact_alignment(
-    task: DifferentiableTask, learner: PPO, direction: Direction, levels: Levels, step: float = 1.0
+    task: DifferentiableTask,
+    learner: PPO | Replica,
+    direction: Direction,
+    levels: Levels,
+    step: float = 1.0,
 ) -> Tensor:
     """Returns the alignment of levels [K, E] by differences of ``step`` learning rates, [K, E]."""
     return alignment(
@@ -307,7 +311,7 @@ class LevelGradients:
     def __init__(self, task: Task) -> None:
         self._task, self._agent = task, task.learner([Streams(0)] * LEVELS_AT_ONCE).agent
 
-    def of_returns(self, learner: PPO, levels: Levels) -> Tensor:
+    def of_returns(self, learner: PPO | Replica, levels: Levels) -> Tensor:
         """Returns |grad|^2 of the exact return of levels, of a differentiable task.
 
         Args:
@@ -325,7 +329,9 @@ class LevelGradients:
 
         return self.lengths(learner, returns, *levels.batch_size)
 
-    def of_rollouts(self, learner: PPO, rollout: TensorDictBase, advantage: Tensor) -> Tensor:
+    def of_rollouts(
+        self, learner: PPO | Replica, rollout: TensorDictBase, advantage: Tensor
+    ) -> Tensor:
         """Returns |grad|^2 of the :func:`surrogate` of levels, from episodes on them.
 
         An estimate of a gradient is longer than the gradient by its noise: short rollouts score
@@ -346,7 +352,9 @@ class LevelGradients:
 
         return self.lengths(learner, gained, *rollout.batch_size[:2])
 
-    def lengths(self, learner: PPO, value: LevelValue, solvers: int, count: int) -> Tensor:
+    def lengths(
+        self, learner: PPO | Replica, value: LevelValue, solvers: int, count: int
+    ) -> Tensor:
         """Returns |grad|^2 of any value of a level, for K Solvers with n levels each, [K, n]."""
         parameters = trainable(self._agent)
         parts = []
@@ -369,7 +377,7 @@ class LevelGradients:
         return torch.cat(parts).unflatten(0, (solvers, count))
 
     @torch.no_grad()
-    def _become(self, learner: PPO, solver: int) -> None:
+    def _become(self, learner: PPO | Replica, solver: int) -> None:
         own = agent_values(self._agent)
         for name, value in agent_values(learner.agent).items():
             own[name].copy_(value[solver])

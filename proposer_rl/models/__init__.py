@@ -6,6 +6,7 @@ from proposer_rl.models.actor_critic import distribution_of as distribution_of
 from proposer_rl.models.actor_critic import draw_at as draw_at
 from proposer_rl.models.actor_critic import joint_categorical as joint_categorical
 from proposer_rl.models.actor_critic import normal as normal
+from proposer_rl.models.actor_critic import one_copy as one_copy
 from proposer_rl.models.actor_critic import orthogonal_ as orthogonal_
 from proposer_rl.models.actor_critic import uniform_noise as uniform_noise
 from proposer_rl.models.grids import UNet as UNet

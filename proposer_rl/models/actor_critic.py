@@ -6,6 +6,8 @@ And the running moments of what it sees and of its rewards, by which it is norma
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -171,6 +173,20 @@ class ActorCritic(TensorDictModuleBase):
         logits = TensorDictModule(nn.Identity(), [self.logits_key], [self.logits_key])
         value = TensorDictModule(nn.Identity(), [self.value_key], [self.value_key])
         return ProbabilisticTensorDictSequential(logits, self.sampler()), value
+
+
+def one_copy(agent: ActorCritic, number: int) -> ActorCritic:
+    """Returns one of an agent's K copies as an agent of one, [1, ...] in the same memory."""
+    own: dict[int, Any] = {
+        id(p): nn.Parameter(p.detach()[number : number + 1], p.requires_grad)
+        for p in agent.parameters()
+    }
+    own |= {id(buffer): buffer[number : number + 1] for buffer in agent.buffers()}
+    alone = deepcopy(agent, own)
+    for module in alone.modules():
+        if hasattr(module, "copies"):
+            module.copies = 1
+    return alone
 
 
 def joint_categorical(logits: Tensor) -> Distribution:

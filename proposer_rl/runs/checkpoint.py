@@ -153,6 +153,8 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[int, State]:
 def learnt_curriculum(path: Path) -> State:
     """Reads the curriculum's part of a checkpoint, of a run's newest one, or of what it left.
 
+    Of several seeds it is the first one's.
+
     Raises:
         CheckpointError: if there is none, or it cannot be used.
         StorageError: if it cannot be read.
@@ -162,8 +164,9 @@ def learnt_curriculum(path: Path) -> State:
         latest = load_checkpoint(path / PROPOSER)
     if latest is None:
         raise CheckpointError(f"the folder holds no checkpoints and no {PROPOSER}")
-    state: State = latest[1]["curriculum"]
-    return state
+    state = latest[1]
+    learnt: State = state["curricula"][0] if "curricula" in state else state["curriculum"]
+    return learnt
 
 
 def _plain(value: object, where: str) -> object:

@@ -21,6 +21,7 @@ from torchrl.envs import EnvBase
 
 from proposer_rl.learning import (
     PPO,
+    Replica,
     RolloutCollector,
     SolverSettings,
     first_episode_return,
@@ -199,17 +200,19 @@ class Task(ABC):
             ppo.compile()
         return ppo.replay(rollouts="rollouts" in self.replayed) if self._graphs else ppo
 
-    def spectators(self, learner: PPO) -> tuple[EnvBase, RolloutCollector]:
+    def spectators(self, learner: PPO | Replica) -> tuple[EnvBase, RolloutCollector]:
         """Returns where the Solvers of a learner play levels [K, P] that they do not train on.
 
         Returns:
             The environment, and what rolls out whole episodes there: the learner's own where its
             rollouts begin with their levels.
         """
-        if not learner.settings.continue_episodes:
+        horizon = learner.settings.horizon
+        if learner.settings.continue_episodes:
+            horizon = max(self.max_steps, horizon)
+        elif isinstance(learner, PPO):
             return learner.env, learner.collector
-        env = self.environment(self._placeholders(*learner.env.batch_size))
-        horizon = max(self.max_steps, learner.horizon)
+        env = self.environment(self._placeholders(learner.agent.copies or 1, self.batch_size))
         return env, RolloutCollector(env, learner.agent, horizon)
 
     def performance(

@@ -14,26 +14,23 @@ OF_LEVELS = ("optimal_return", "exact_performance", "performance", "play")
 
 
 def adapted(name: str, function: Any, given: Callable[[Any], Any], device: torch.device) -> Any:
-    """Returns a function of levels [1, n] that calls a loop's own function of levels [n].
+    """Returns a function of levels [n] that calls a loop's own, with levels as the loop gets them.
 
     Args:
         name: of the function; see :class:`~proposer_rl.curricula.Student`.
-        function: of a loop, called with levels as the loop gets them.
-        given: makes these of levels.
+        function: of a loop.
+        given: makes the loop's levels of levels.
         device: on which it gets them.
     """
     if name not in OF_LEVELS:
         return function
 
-    def of_one(levels: Any, *more: Any) -> Any:
-        some = moved(levels[0] if levels.ndim > 1 else levels, device)
-        draws = [more[0][0]] if name == "play" else []
-        found = function(given(some.clone()), *draws)  # which may change them
-        if isinstance(found, TensorDictBase):
-            return found if found.ndim > 2 else found.unsqueeze(0)
+    def of_levels(levels: Any, *more: Any) -> Any:
+        draws = more if name == "play" else ()
+        found = function(given(moved(levels, device).clone()), *draws)  # which may change them
         if isinstance(found, dict):
             entries = {key: torch.as_tensor(entry).float() for key, entry in found.items()}
-            return TensorDict(entries, some.shape).unsqueeze(0)
-        return torch.as_tensor(found).unsqueeze(0)
+            return TensorDict(entries, levels.shape[:1])
+        return found if isinstance(found, TensorDictBase) else torch.as_tensor(found)
 
-    return of_one
+    return of_levels

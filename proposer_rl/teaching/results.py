@@ -24,7 +24,7 @@ ENDS = ("done", "terminated", "truncated", "success")
 
 
 def as_outcome(results: Mapping[str, NDArray[np.float64]]) -> TensorDict:
-    """Returns the outcome [K, n] that curricula observe, from results [K, n] by name.
+    """Returns the outcome [m] that curricula observe, from results [m] by name.
 
     NaN is a result that the loop did not give: a count is then 1; another result that is missing
     for one level is left out for all.
@@ -65,7 +65,7 @@ def as_result(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float
 
 
 def outcome_of_rollout(rollout: TensorDictBase, rule: Any) -> TensorDict:
-    """Returns the outcome [K, n] of a rollout [K, n, T], without success where nothing says it.
+    """Returns the outcome [n] of a rollout [n, T], without success where nothing says it.
 
     Args:
         rollout: with ``success`` in its ``next``, or without.
@@ -91,7 +91,7 @@ def ended(
             first.
 
     Returns:
-        Their levels' numbers [m]; a rollout [1, m, L] of whole episodes, in which what is behind
+        Their levels' numbers [m]; a rollout [m, L] of whole episodes, in which what is behind
         the end of each is no step, as ``is_step`` says: it has no reward and no end; and what is to
         be kept for the next rollout.
 
@@ -124,11 +124,11 @@ def ended(
     length = (end - start + 1).max() if len(end) else 0
     step = start.unsqueeze(1) + time[: int(length)]
     inside = (step <= end.unsqueeze(1)).unsqueeze(-1)  # [m, L, 1]
-    episodes = steps[order[step.clamp(max=len(ids) - 1)]].unsqueeze(0)
+    episodes = steps[order[step.clamp(max=len(ids) - 1)]]
     after = episodes["next"]
     for name in set(ENDS) & set(after.keys()):
         after[name] = after[name] & inside
     after["reward"] = after["reward"] * inside
-    episodes["is_step"] = inside.squeeze(-1).unsqueeze(0)
-    episodes.names = [None, None, "time"]
+    episodes["is_step"] = inside.squeeze(-1)
+    episodes.names = [None, "time"]
     return ids[end].cpu().numpy(), episodes, left

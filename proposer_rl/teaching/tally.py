@@ -29,8 +29,8 @@ class Tally:
         self._clear()
 
     def count(self, levels: Levels) -> None:
-        """Counts levels [K, n] that were handed out."""
-        self._proposed += levels.shape[1]
+        """Counts levels [n] that were handed out."""
+        self._proposed += len(levels)
         for name, bins in self._bins(levels).items() if self._texts else ():
             self._drawn[name] += bins.bincount(minlength=len(self._texts[name]))
 

@@ -19,8 +19,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
-from proposer_rl.curricula import Batch, Curriculum, Student, require
+from proposer_rl.curricula import Curriculum, Student, require
 from proposer_rl.curricula.batches import CPU, moved, packed
+from proposer_rl.curricula.contract import outcome_of_episodes, proposed
 from proposer_rl.curricula.ledger import OUT, OVER, RETURNED, Block, Ledger
 from proposer_rl.models import check_torch_defaults
 from proposer_rl.recipes import Recipe
@@ -132,7 +133,8 @@ class Teacher:
         require(self.student, self.curriculum.needs, named or type(self.curriculum).__name__)
         self._given, self._rows_of = given, getattr(space, "rows", list)
         self._success = success
-        self._ledger, self._tally = Ledger(dict.fromkeys(RESULTS, float)), Tally(space)
+        kinds = {**dict.fromkeys(RESULTS, float), "rollout": object}
+        self._ledger, self._tally = Ledger(kinds), Tally(space)
         self._scored: bool | None = None  # whether results come with a score; None before any
         self._succeeded: set[bool] = set()  # whether they came with a success, or without
         self._proposals = self._levels_told = 0  # the latter up to the last log()
@@ -176,7 +178,7 @@ class Teacher:
                 block, start = self._current(left), self._at
                 self._at = end = min(start + left, block.end)
                 which = slice(start - block.start, end - block.start)
-                block.state[:, which] = OUT
+                block.state[which] = OUT
                 ids.append(torch.arange(start, end, device=self.device))
                 if self._moved is None:
                     self._moved = self._levels(block)
@@ -247,7 +249,7 @@ class Teacher:
             for block, which, place in self._ledger.find(tickets):
                 if "predicted" not in block.batch.notes.keys():
                     return None
-                found[which] = block.batch.notes["predicted"][0, place]
+                found[which] = block.batch.notes["predicted"][place]
             return found
 
     def done_with(self, ids: Any) -> NDArray[np.bool_]:
@@ -402,7 +404,7 @@ class Teacher:
             if number:
                 self._seed += number
                 if self._block is not None:
-                    self._block.state[:, self._at - self._block.start :] = OVER
+                    self._block.state[self._at - self._block.start :] = OVER
                 self._use(None, 0)
 
     @cached_property
@@ -442,9 +444,9 @@ class Teacher:
     def _one(self) -> tuple[int, Any]:
         block, ticket = self._current(1), self._at
         self._at += 1
-        block.state[:, ticket - block.start] = OUT
+        block.state[ticket - block.start] = OUT
         if not self._rows:
-            self._rows = self._rows_of(moved(block.batch.levels, CPU)[0].clone())
+            self._rows = self._rows_of(moved(block.batch.levels, CPU).clone())
         return ticket, self._rows[ticket - block.start]
 
     def _current(self, left: int) -> Block:
@@ -466,7 +468,7 @@ class Teacher:
         block = self._block
         if block is not None and self._at > self._counted:
             some = slice(self._counted - block.start, self._at - block.start)
-            self._tally.count(block.batch.levels[:, some])
+            self._tally.count(block.batch.levels[some])
             self._counted = self._at
 
     @torch.inference_mode(False)
@@ -474,52 +476,41 @@ class Teacher:
         """Lets the curriculum observe the results there are, and returns what it then proposes."""
         check_torch_defaults()
         for batch, results in self._ledger.take():
-            self.curriculum.observe(self.student, batch, as_outcome(results))
-        streams = Streams(self._seed, "update", self._proposals)
-        batch = self.curriculum.propose(self.student, count, [streams])
-        given = list(batch.notes.batch_size) if isinstance(batch, Batch) else type(batch).__name__
-        if given != [1, count]:
-            raise ArgumentError(
-                f"curriculum={type(self.curriculum).__name__}: must propose a Batch of levels "
-                f"{[1, count]}, got {given}"
-            )
+            self.curriculum.observe(self.student, batch, _outcome(results))
+        rng = Streams(self._seed, "update", self._proposals)
+        batch = proposed(self.curriculum, self.student, count, rng)
         self._proposals += 1
         return self._ledger.add(batch)
 
     def _levels(self, block: Block) -> Any:
         """Returns the levels of a block as the loop gets them, which may change them."""
-        return self._given(moved(block.batch.levels, self.device)[0].clone())
+        return self._given(moved(block.batch.levels, self.device).clone())
 
     def _tell(self, ids: NDArray[np.int64], results: Mapping[str, Any]) -> None:
-        arrays = {
-            name: as_result(name, value, (len(ids),))[np.newaxis] for name, value in results.items()
-        }
+        arrays = {name: as_result(name, value, (len(ids),)) for name, value in results.items()}
         self._check_score(results)
         self._ledger.tell(self._ledger.find(ids), arrays)
         self._tally.returned(len(ids), arrays["return"], arrays.get("success"))
 
     def _observe_rollout(self, ids: NDArray[np.int64], rollout: TensorDictBase) -> None:
-        """Observes a rollout [n, T] or [1, n, T], with a row for each ticket."""
-        rollout = rollout.unsqueeze(0) if rollout.ndim < 3 else rollout
-        if tuple(rollout.batch_size[:2]) != (1, len(ids)):
+        """Notes what came of a rollout [n, T] or [1, n, T], with a row for each ticket."""
+        rollout = rollout[0] if rollout.ndim > 2 else rollout
+        if len(rollout) != len(ids):
             raise ArgumentError(
                 f"rollout: has shape {list(rollout.batch_size)}, but must have a row for each of "
                 f"{len(ids)} levels"
             )
-        parts = self._ledger.find(ids)
         outcome = outcome_of_rollout(rollout, self._success)
         known = "success" in outcome.keys()
         self._require("success", known, "give Teacher(success=...), or the rollout a next success")
-        numbers = {
-            name: as_result(name, outcome[name][0], (len(ids),))
+        results: dict[str, NDArray[Any]] = {
+            name: as_result(name, outcome[name], (len(ids),))
             for name in (("return", "success") if known else ("return",))
         }
-        for block, which, place in parts:
-            rows = torch.from_numpy(which).to(outcome["return"].device)
-            batch = block.batch[:, torch.from_numpy(place)]
-            self.curriculum.observe(self.student, batch, outcome[:, rows])
-        self._ledger.drop(parts)
-        self._tally.returned(len(ids), numbers["return"], numbers.get("success"))
+        results["rollout"] = np.empty(len(ids), object)
+        results["rollout"][:] = outcome["rollout"].unbind(0)
+        self._ledger.tell(self._ledger.find(ids), results)
+        self._tally.returned(len(ids), results["return"], results.get("success"))
 
     def _check_score(self, results: Mapping[str, Any]) -> None:
         if self._scored not in (None, "score" in results):
@@ -554,3 +545,13 @@ class Teacher:
                 "need ask(n) and its tickets"
             )
         return np.arange(out[0].start, out[0].end)
+
+
+def _outcome(results: Mapping[str, NDArray[Any]]) -> TensorDict:
+    """Returns the outcome [m] that curricula observe, from results [m] by name."""
+    numbers = dict(results)
+    rollouts = numbers.pop("rollout").tolist()
+    if any(rollout is None for rollout in rollouts):
+        return as_outcome(numbers)
+    outcome = outcome_of_episodes(rollouts)
+    return outcome.exclude("success") if np.isnan(numbers["success"]).any() else outcome

@@ -10,6 +10,7 @@ from pathlib import Path
 from proposer_rl.cli.build import Made, parts
 from proposer_rl.cli.config import RunConfig, checked_config
 from proposer_rl.curricula import LearnedCurriculum, TaskStudent, outcome_of
+from proposer_rl.curricula.contract import proposed
 from proposer_rl.report.reading import UnreadableRun, find_runs
 from proposer_rl.report.studies import Group, Study, read_studies
 from proposer_rl.runs.process import StopSignals
@@ -128,7 +129,7 @@ class Training:
     """A Solver on a curriculum, as in a run but for measurements and checkpoints."""
 
     def __init__(self, made: Made) -> None:
-        task, self.learner, self.curriculum = made
+        task, self.learner, (self.curriculum,) = made
         self.student = TaskStudent(task, self.learner)
         self.count = 0
 
@@ -140,7 +141,7 @@ class Training:
     def improve(self) -> None:
         """What comes before a cycle."""
         if isinstance(self.curriculum, LearnedCurriculum):
-            self.curriculum.improve(self.student, [Streams(0, "cycle", self.count)])
+            self.curriculum.improve(self.student, Streams(0, "cycle", self.count))
         self.curriculum.log()
 
     def updates(self, count: int = STRETCH) -> None:
@@ -148,9 +149,9 @@ class Training:
         for _ in range(count):
             stream = Streams(0, "update", self.count)
             size = self.learner.env.batch_size[1:].numel()
-            batch = self.curriculum.propose(self.student, size, [stream])
-            self.learner.env.set_levels(batch.levels)
+            batch = proposed(self.curriculum, self.student, size, stream)
+            self.learner.env.set_levels(batch.levels.unsqueeze(0))
             update = self.learner.update([stream.generator("actions")])
             self.learner.check()
-            self.curriculum.observe(self.student, batch, outcome_of(update.rollout))
+            self.curriculum.observe(self.student, batch, outcome_of(update.rollout[0]))
             self.count += 1

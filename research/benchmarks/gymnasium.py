@@ -17,8 +17,8 @@ import pandas as pd
 from omegaconf import OmegaConf
 
 from proposer_rl.cli.build import parts
-from proposer_rl.curricula import TaskStudent
-from proposer_rl.curricula.continued import ContinuedLevels
+from proposer_rl.experiment.continued import ContinuedLevels
+from proposer_rl.experiment.side_by_side import SideBySide
 from proposer_rl.recipes import CONFIG_FOLDER, override_value
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.runs.process import StopSignals
@@ -114,14 +114,13 @@ def train_ours(environment: str, seeds: Sequence[int], frames: int, episodes: in
     """Train Solvers of these seeds side by side on an environment's one level, and evaluate."""
     config = composed(*_overrides(environment, seeds, frames, episodes))
     made = parts(config, StopSignals())
-    student = TaskStudent(made.task, made.learner)
-    like = made.task.evaluated_on["target"]
-    levels = ContinuedLevels(made.curriculum, student, made.learner, like)
+    sides = SideBySide(made.task, made.learner, made.curricula)
+    like = made.task.evaluated_on["target"][0]
+    levels = ContinuedLevels(made.curricula, sides.students, made.learner, like)
     started = time.process_time()
     for update in range(config.schedule.updates):
         _, credits = levels.update([Streams(seed, "update", update) for seed in seeds])
-        for credit in credits:
-            made.curriculum.observe(student, *credit)
+        sides.observe(credits)
     cpu = (time.process_time() - started) / len(seeds)
     returns = made.task.evaluate(made.learner.agent)["target"]["return"]
     each = config.schedule.updates * config.solver.batch_size * config.solver.ppo.horizon

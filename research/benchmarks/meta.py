@@ -142,6 +142,6 @@ def memory(options: Options) -> Result:
 
 def trainer_of(made: Made) -> ProposerTrainer:
     """What trains the Proposer of a run of `perf_gain`."""
-    curriculum: Any = made.curriculum
+    curriculum: Any = made.curricula[0]
     trainer: ProposerTrainer = curriculum.trainer
     return trainer

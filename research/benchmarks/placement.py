@@ -67,7 +67,7 @@ def _workers(engine: str, count: int, options: Options) -> list[str]:
 def _cycle(scale: Scale, options: Options, stack: ExitStack, *workers: str) -> Callable[[], object]:
     """Rolls the replicas of a cycle out, always the same ones."""
     made = scale.made(options, "compute.cores=1", *workers)
-    stack.enter_context(closing(made.curriculum))
+    stack.enter_context(closing(made.curricula[0]))
     replicas, solver = trainer_of(made).replicas, made.learner.snapshot()[0]
     return partial(replicas.roll_out, solver, Streams(0, "cycle", 0))
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from proposer_rl.curricula.continued import ContinuedLevels, outcome_of_episodes
 from tensordict import TensorDictBase
 
 from proposer_rl.curricula import (
@@ -24,7 +25,6 @@ from proposer_rl.curricula import (
     TaskStudent,
 )
 from proposer_rl.curricula.batches import fresh_levels
-from proposer_rl.curricula.continued import ContinuedLevels, outcome_of_episodes
 from proposer_rl.experiment import Experiment, ScheduleSettings
 from proposer_rl.learning import PPOSettings, RolloutCollector, SolverSettings
 from proposer_rl.runs.folder import RunFolder
