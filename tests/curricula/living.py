@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, outcome_of
-from proposer_rl.learning import PPO, PPOSettings, SolverSettings, Update
+import torch
+
+from proposer_rl.curricula import Curriculum, TaskStudent, outcome_of
+from proposer_rl.experiment.side_by_side import SideBySide
+from proposer_rl.learning import PPO, PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes.maze_settings import UNetSettings
 from tests.tiny import tiny_task
@@ -19,12 +22,12 @@ TASK = tiny_task(
 
 
 class Lived(NamedTuple):
-    """What there was to see: each update's levels [K, P], its cost and its rollout."""
+    """What there was to see: each update's levels [n], its cost and its rollout [n, T]."""
 
     levels: list[Any]
     frames: list[int]
     evaluations: list[int]
-    updates: list[Update]
+    rollouts: list[Any]
     told: list[dict[str, Any]]
 
 
@@ -32,35 +35,36 @@ def solvers(seeds: Sequence[int]) -> PPO:
     return TASK.learner([Streams(seed, "solver") for seed in seeds])
 
 
-def student(*seeds: int) -> TaskStudent:
-    return TaskStudent(TASK, solvers(seeds or [0]))
+def student(seed: int = 0) -> TaskStudent:
+    return TaskStudent(TASK, solvers([seed]))
 
 
 def live(
-    curriculum: Curriculum,
+    curricula: Sequence[Curriculum],
     learner: PPO,
     seeds: Sequence[int],
     updates: range,
     cycle: int = 3,
-) -> Lived:
-    """Train."""
-    lived = Lived([], [], [], [], [])
-    taught = TaskStudent(TASK, learner)
+) -> list[Lived]:
+    """Train Solvers side by side, each on a curriculum of its own."""
+    lives = [Lived([], [], [], [], []) for _ in seeds]
+    sides = SideBySide(TASK, learner, curricula)
     for number in updates:
         if number % cycle == 0:
-            streams = [Streams(seed, "cycle", number) for seed in seeds]
-            metrics = {}
-            if isinstance(curriculum, LearnedCurriculum):
-                metrics = curriculum.improve(taught, streams)
-            lived.told.append({**curriculum.log(), **metrics})
-        taught.frames, taught.evaluations = 0, 0
+            metrics = sides.improve([Streams(seed, "cycle", number) for seed in seeds])
+            for life, curriculum, own in zip(lives, curricula, metrics, strict=True):
+                life.told.append({**curriculum.log(), **own})
+        for student in sides.students:
+            student.frames, student.evaluations = 0, 0
         streams = [Streams(seed, "update", number) for seed in seeds]
-        batch = curriculum.propose(taught, TASK.batch_size, streams)
-        learner.env.set_levels(batch.levels)
+        batches = sides.propose(TASK.batch_size, streams)
+        learner.env.set_levels(torch.stack([batch.levels for batch in batches]))
         update = learner.update([stream.generator("actions") for stream in streams])
-        curriculum.observe(taught, batch, outcome_of(update.rollout))
-        for entries, entry in zip(
-            lived, (batch.levels, taught.frames, taught.evaluations, update), strict=False
-        ):
-            entries.append(entry)
-    return lived
+        outcomes = map(outcome_of, update.rollout)
+        sides.observe([[credit] for credit in zip(batches, outcomes, strict=True)])
+        each = zip(lives, batches, sides.students, update.rollout, strict=True)
+        for life, batch, student, rollout in each:
+            seen = batch.levels, student.frames, student.evaluations, rollout
+            for entries, entry in zip(life, seen, strict=False):
+                entries.append(entry)
+    return lives

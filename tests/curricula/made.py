@@ -28,7 +28,6 @@ from proposer_rl.curricula import (
     Scorer,
     SelectionCurriculum,
     SelfPacedCurriculum,
-    TaskStudent,
     TransportCurriculum,
 )
 from proposer_rl.learning import PPOSettings
@@ -80,9 +79,9 @@ def problem_agent() -> ActorCritic:
 
 
 def paired(streams: Streams | None = None) -> PairedProposer:
-    antagonist = TaskStudent(TASK, TASK.learner([streams or Streams(0, "antagonist")]))
+    antagonist = TASK.learner([streams or Streams(0, "antagonist")])
     return PairedProposer(
-        SPACE, TARGET, problem_agent(), SETTINGS, antagonist=antagonist, probe_levels=2
+        SPACE, TARGET, problem_agent(), SETTINGS, task=TASK, antagonist=antagonist, probe_levels=2
     )
 
 
@@ -201,4 +200,3 @@ LEARNED: dict[str, Make] = {
     "paired": paired,
     "filtered paired": lambda: filtered(paired(), times=2),
 }
-"""Of one Solver alone."""

@@ -10,17 +10,18 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from proposer_rl.curricula import Curriculum, Scorer, Student
+from proposer_rl.curricula.contract import proposed
 from proposer_rl.curricula.scores import Scored, unseen
 from proposer_rl.streams import Streams
 
 
 class Scripted(Student):
-    """Levels are the numbers of their bins; success and return in a bin are ``skills`` [K, N]."""
+    """Levels are the numbers of their bins; success and return in a bin are ``skills`` [N]."""
 
     def __init__(self, skills: Tensor, batch_size: int = 32, told: str = "success") -> None:
         super().__init__()
         self.skills, self.count, self.told = skills, batch_size, told
-        size = skills.shape[1]
+        size = len(skills)
         self.space: Any = SimpleNamespace(
             size=size,
             axes={"place": list(range(size))},
@@ -32,8 +33,8 @@ class Scripted(Student):
 
     def performance(self, levels: Tensor, generator: torch.Generator) -> TensorDict:
         self.measured.append(levels)
-        self.spend(evaluations=levels.shape[1])
-        reached = self.skills.gather(1, levels)
+        self.spend(evaluations=len(levels))
+        reached = self.skills[levels]
         return TensorDict({"return": reached} | {self.told: reached}, levels.shape)
 
     def exact_performance(self, levels: Tensor) -> TensorDict:
@@ -41,22 +42,21 @@ class Scripted(Student):
 
 
 def reached(returns: Tensor, success: Tensor | None = None) -> TensorDict:
-    """An outcome with these returns [K, n]; a success where one is above a half."""
+    """An outcome with these returns [n]; a success where one is above a half."""
     solved = returns > 0.5 if success is None else success
     return TensorDict({"return": returns, "success": solved.float()}, returns.shape)
 
 
-def step(curriculum: Curriculum, student: Scripted, update: int, *seeds: int) -> Tensor:
-    """One update, in which every level's episode goes as the table says; the bins [K, n]."""
-    streams = [Streams(seed, "update", update) for seed in seeds or range(len(student.skills))]
-    batch = curriculum.propose(student, student.count, streams)
-    curriculum.observe(student, batch, reached(student.skills.gather(1, batch.levels)))
+def step(curriculum: Curriculum, student: Scripted, update: int, seed: int = 0) -> Tensor:
+    """One update, in which every level's episode goes as the table says; the bins [n]."""
+    batch = proposed(curriculum, student, student.count, Streams(seed, "update", update))
+    curriculum.observe(student, batch, reached(student.skills[batch.levels]))
     levels: Tensor = batch.levels
     return levels
 
 
 class GivenScores(Scorer):
-    """Scores levels [K, n], whatever they are, by numbers [K, n] that a test gives."""
+    """Scores levels [n], whatever they are, by numbers [n] that a test gives."""
 
     needs = ()
 
@@ -64,4 +64,4 @@ class GivenScores(Scorer):
         self._numbers = numbers.double()
 
     def __call__(self, *given: Any) -> Scored:
-        return Scored(self._numbers, unseen(given[1].shape[:2]))
+        return Scored(self._numbers, unseen(len(given[1])))
