@@ -52,7 +52,7 @@ def main(updates: int = 200) -> None:
         optimiser.zero_grad(), loss.backward(), optimiser.step()
         teacher.observe({"return": reward.sum(0), "score": advantage.detach().abs().mean(0)})
         if update % 20 == 19:
-            edits = 5 * teacher.log()["mean_generation"][0]
+            edits = 5 * teacher.log()["mean_generation"]
             print(f"{update}: return {reward.sum(0).mean():.2f}, {edits:.1f} edits of a maze")
 
 

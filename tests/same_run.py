@@ -46,7 +46,7 @@ def trained(folder: Path) -> dict[str, torch.Tensor]:
     latest = load_latest(folder / "checkpoints")
     assert latest is not None
     state = latest[1]
-    return dict(_leaves({"solver": state["solver"], "curriculum": state["curriculum"]}))
+    return dict(_leaves({"solver": state["solver"], "curricula": state["curricula"]}))
 
 
 def assert_same_run(one: Path, other: Path) -> None:

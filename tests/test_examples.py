@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
-from proposer_rl.curricula import TaskStudent, outcome_of
+import proposer_rl as prl
 from proposer_rl.meta.rewards import TrainingStep
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.mazes import Level
 from tests.commands import SMOKE
 
 ROOT = Path(__file__).parents[1]
@@ -90,41 +88,25 @@ def test_the_reward_is_learnability_by_hand(example: Load) -> None:
     torch.testing.assert_close(own.learnability(step), expected)
 
 
-def failures(probability: float, example: Load) -> tuple[Level, Tensor, Level]:
-    """Levels, which of them were failed on, and what is proposed next."""
-    task = example("small_mazes").small_task()
-    solver = task.learner([Streams(0, "solver")])
-    make = example("own_curriculum").Again
-    curriculum = make(task.target, probability)
-    student = TaskStudent(task, solver)
-    batch = curriculum.propose(student, 32, [Streams(0)])
-    levels = batch.levels
-    solver.env.set_levels(levels)
-    update = solver.update([torch.Generator().manual_seed(0)])
-    curriculum.observe(student, batch, outcome_of(update.rollout))
-    resumed = make(task.target, probability)
-    resumed.load_state_dict(curriculum.state_dict())
-    following = [c.propose(student, 32, [Streams(1)]).levels for c in (curriculum, resumed)]
-    assert (following[0] == following[1]).all()
-    ends = update.rollout["next"]
-    first = ends["done"].squeeze(-1).int().argmax(-1, keepdim=True)  # the first end's step
-    solved = ends["terminated"].squeeze(-1).gather(-1, first).squeeze(-1)
-    return levels, ~solved, following[0]
+def test_failed_levels_come_again(example: Load) -> None:
+    """In order and out of it, and from a state."""
+    again = example("own_curriculum").Again
+    space = prl.Parameters({"force": (0.0, 1.0)})
+    teacher, resumed = (prl.Teacher(again(space), space, block=32) for _ in range(2))
+    ids, levels = teacher.ask(32)
+    failed = levels["force"] > 0.5
+    order = torch.randperm(32, generator=torch.Generator().manual_seed(0))
+    for some in order.split(8):
+        teacher.tell(ids[some], 0.0 * some, ~failed[some])
+    teacher.drop()
+    resumed.load_state_dict(teacher.state_dict())
+    following, others = (each.propose(32)["force"] for each in (teacher, resumed))
+    assert torch.equal(following, others)
+    assert torch.equal(following[: failed.sum()], levels["force"][failed]) and 0 < failed.sum() < 32
 
 
-@pytest.mark.parametrize("probability", [0.0, 1.0])
-def test_failed_levels_come_again(probability: float, example: Load) -> None:
-    levels, failed, following = failures(probability, example)
-    same = (levels.walls == following.walls).all(-1).all(-1)
-    assert failed.any() and not failed.all()
-    assert torch.equal(same, failed if probability else torch.zeros_like(failed))
-
-
-@pytest.mark.parametrize("name", ["own_reward", "own_curriculum"])
-def test_a_solver_is_trained_with_it(
-    name: str, example: Load, capsys: pytest.CaptureFixture[str]
-) -> None:
-    example(name).main(1)
+def test_a_solver_is_trained_with_it(example: Load, capsys: pytest.CaptureFixture[str]) -> None:
+    example("own_reward").main(1)
     assert len(numbers(capsys.readouterr().out, r"success (\S+)")) == 2
 
 

@@ -261,8 +261,8 @@ class Teacher:
         """Gives up levels of which no results will come, as of episodes that were cut off.
 
         Args:
-            ids: the tickets, of which some may be over; None for all that are out, as where a
-                resumed loop begins anew.
+            ids: the tickets, of which some may be over or have been told; None for all that are
+                out, as where a resumed loop begins anew.
         """
         with self._here():
             if ids is None:
@@ -271,7 +271,7 @@ class Teacher:
                 self._whole.clear()
             else:
                 tickets = as_ids("ids", ids)
-                going = tickets[self._ledger.states(tickets) != OVER]
+                going = tickets[~self.done_with(tickets)]
                 self._ledger.drop(self._ledger.find(going))
                 dropped = len(going)
             self._tally.dropped(dropped)

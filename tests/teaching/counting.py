@@ -29,19 +29,19 @@ class Counting(Curriculum):
         self.seen: dict[int, tuple[float, float]] = {}
         self.rollouts: dict[int, TensorDictBase] = {}
 
-    def propose(self, student: Any, count: int, streams: Any) -> Batch:
-        numbers = torch.arange(self.count, self.count + count).unsqueeze(0)
+    def propose(self, student: Any, count: int, rng: Any) -> Batch:
+        numbers = torch.arange(self.count, self.count + count)
         self.count += count
         levels = TensorDict({"item": numbers}, numbers.shape)
         return Batch(levels, levels.clone())
 
     def observe(self, student: Any, batch: Batch, outcome: TensorDictBase) -> None:
         success = outcome.get("success", torch.full_like(outcome["return"], torch.nan))
-        for i, number in enumerate(batch.notes["item"][0].tolist()):
+        for i, number in enumerate(batch.notes["item"].tolist()):
             assert number not in self.seen
-            self.seen[number] = float(outcome["return"][0, i]), float(success[0, i])
+            self.seen[number] = float(outcome["return"][i]), float(success[i])
             if "rollout" in outcome.keys():
-                self.rollouts[number] = outcome["rollout"][0, i]
+                self.rollouts[number] = outcome["rollout"][i]
 
     def load_state_dict(self, state: Any) -> None:
         """Goes on with what it has seen."""

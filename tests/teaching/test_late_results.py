@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 
 import proposer_rl as prl
-from proposer_rl.curricula import Batch, Curriculum
+from proposer_rl.curricula import Curriculum
 from proposer_rl.settings import ArgumentError
 from tests.curricula.test_contract import same
 from tests.teaching.counting import ITEMS, Counting, through_torch
@@ -34,6 +34,7 @@ def test_an_episode_may_be_longer_than_rollouts(resumed: bool) -> None:
             state = through_torch(teacher.state_dict())
             teacher = prl.Teacher(curriculum, ITEMS)
             teacher.load_state_dict(state)
+    teacher.propose(1)
     assert curriculum.seen[0][0] == 10
 
 
@@ -56,7 +57,7 @@ def test_logs_change_nothing() -> None:
     assert levels == logged
     model, other = (one.curriculum._model.state_dict() for one in (teacher, often))
     assert same(model, other)
-    assert sum(len(batch["return"][0]) for batch in model["batches"]) == 320
+    assert sum(len(batch["return"]) for batch in model["batches"]) == 320
 
 
 def test_all_that_comes_between_two_proposals_is_one_batch_of_the_model() -> None:
@@ -68,7 +69,7 @@ def test_all_that_comes_between_two_proposals_is_one_batch_of_the_model() -> Non
     teacher.tell(ids[1::8], torch.arange(60.0))
     teacher.propose(1)
     batches = teacher.curriculum._model.state_dict()["batches"]
-    assert [batch["return"][0].tolist() for batch in batches] == [[*range(60)]] * 2
+    assert [batch["return"].tolist() for batch in batches] == [[*range(60)]] * 2
 
 
 def test_a_score_is_told_of_all_levels_or_of_none() -> None:
@@ -87,7 +88,7 @@ def test_a_score_is_told_of_all_levels_or_of_none() -> None:
         resumed.tell(7, 0.0)
     first.tell(7, 0.0, score=5.0)  # what was refused counts nothing
     first.propose(1)
-    assert first.log()["mean_score"] == [5.0]
+    assert first.log()["mean_score"] == 5.0
     second = teacher()
     second.tell(second.ask()[0], 0.0)
     with pytest.raises(ArgumentError, match="score: others had none; give it for all or for none"):
@@ -199,9 +200,8 @@ def test_one_number_of_episodes_stands_for_all_tickets() -> None:
     seen = []
 
     class Spy(Curriculum):
-        def propose(self, student: Any, count: int, streams: Any) -> Batch:
-            levels = TensorDict({"item": torch.zeros(1, count, dtype=torch.int64)}, [1, count])
-            return Batch(levels, levels.clone())
+        def propose(self, student: Any, count: int, rng: Any) -> TensorDict:
+            return TensorDict({"item": torch.zeros(count, dtype=torch.int64)}, [count])
 
         def observe(self, student: Any, batch: Any, outcome: Any) -> None:
             seen.append([outcome[name].tolist() for name in ("return", "episodes", "steps")])
@@ -211,7 +211,7 @@ def test_one_number_of_episodes_stands_for_all_tickets() -> None:
     teacher.tell(ids[:2], [1.0, 2.0], episodes=8)
     teacher.tell(int(ids[2]), 5.0, episodes=7)
     teacher.propose(1)
-    assert seen == [[[[1, 2, 5]], [[8, 8, 7]], [[1] * 3]]]
+    assert seen == [[[1, 2, 5], [8, 8, 7], [1] * 3]]
 
 
 @pytest.mark.parametrize("how", ["propose", "ask(n)", "ask()", "play"])

@@ -315,9 +315,9 @@ def test_means_of_several_answers_are_weighted_and_say_what_differed() -> None:
     sampler.tell([0, 0, 1, 1, 2], [1, 0, 0.25, 0.75, 1], episodes=[3, 1, 1, 1, 4])
     sampler.tell([2, 3, 3], [1, 0.5, 0.5], episodes=[4, 1, 1])
     results = teacher._ledger.blocks[0].results
-    told = dict(zip(items, results["success"][0].tolist(), strict=True))
+    told = dict(zip(items, results["success"].tolist(), strict=True))
     assert told == {0: 0.75, 1: 0.5, 2: 1, 3: 0.5}
-    assert dict(zip(items, results["episodes"][0].tolist(), strict=True)) == {
+    assert dict(zip(items, results["episodes"].tolist(), strict=True)) == {
         0: 4,
         1: 2,
         2: 8,

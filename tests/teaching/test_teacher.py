@@ -22,7 +22,7 @@ from tensordict import TensorDict
 from torch.utils._pytree import tree_leaves
 
 import proposer_rl as prl
-from proposer_rl.curricula import Batch, Curriculum
+from proposer_rl.curricula import Curriculum
 from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching.remote import TeacherClient
 from tests.curricula.test_contract import same
@@ -461,7 +461,7 @@ def test_a_rollout_without_success_is_refused_where_termination_may_be_failure()
         teacher.propose(2)
         teacher.observe(prl.outcome_of(rollout()))
         teacher.ask(1)  # what came in is taken in
-        known = teacher.curriculum.scores["fast"][0]
+        known = teacher.curriculum.scores["fast"]
         return sorted(known[known.isfinite()].tolist())
 
     with pytest.raises(ArgumentError, match="success: missing: this curriculum reads it; give Tea"):
@@ -477,19 +477,17 @@ def test_a_rollout_without_values_is_refused_where_they_are_read(score: str) -> 
     after = {"done": ends, "terminated": ends, "reward": torch.ones(1, 1, 1)}
     teacher = prl.Teacher(prl.curricula.plr(score=score), SPACE)
     teacher.propose(1)
+    teacher.observe(prl.outcome_of(TensorDict({"next": after}, [1, 1])))
     with pytest.raises(ArgumentError, match=r"^rollout: has no state_value"):
-        teacher.observe(prl.outcome_of(TensorDict({"next": after}, [1, 1])))
+        teacher.propose(1)
 
 
-@pytest.mark.parametrize("shape", [(4,), (1, 3)])
-def test_a_curriculum_of_ones_own_must_propose_what_was_asked_for(shape: tuple[int, ...]) -> None:
+def test_a_curriculum_of_ones_own_must_propose_what_was_asked_for() -> None:
     class Short(Curriculum):
-        def propose(self, student: Any, count: int, streams: Any) -> Batch:
-            return Batch(SPACE.sample(math.prod(shape), torch.Generator()).reshape(shape))
+        def propose(self, student: Any, count: int, rng: Any) -> Any:
+            return SPACE.sample(3, torch.Generator())
 
-    with pytest.raises(
-        ArgumentError, match=rf"^curriculum=Short: .* \[1, 4\], got .*{shape[-1]}\]"
-    ):
+    with pytest.raises(ArgumentError, match=r"^curriculum=Short: proposes 3 levels where 4"):
         prl.Teacher(Short(), SPACE).propose(4)
 
 
@@ -510,7 +508,7 @@ def recipe(name: str, **settings: Any) -> Any:
 NO_TARGET = prl.Parameters({"gravity": (0.0, 1.0)})
 NEEDS = {
     "sfl": r"student with exact_performance: it has no exact_performance\(levels\)",
-    "robust_plr": r"student with play: it has no play\(levels, generators\)",
+    "robust_plr": r"student with play: it has no play\(levels, generator\)",
     "accel": "student with play",
     "currot": "student with performance",
     "pace": "student with gradient_norms",
@@ -648,7 +646,7 @@ def test_the_parts_of_a_curriculum_are_one_import_and_their_defaults_agree() -> 
         for _ in range(3):
             ids, levels = teacher.ask(8)
             teacher.tell(ids, solved(levels)["success"])
-        assert teacher.log()["filled"][0] >= 8, some
+        assert teacher.log()["filled"] >= 8, some
 
 
 def test_a_score_from_gradients_says_what_it_lacks_and_takes_a_function() -> None:
@@ -663,13 +661,13 @@ def test_a_score_from_gradients_says_what_it_lacks_and_takes_a_function() -> Non
 
     teacher = prl.Teacher(recipe, SPACE, policy_gradient_norms=norms)
     levels = teacher.propose(8)
-    ends = torch.ones(1, 8, 3, 1, dtype=torch.bool)
-    after = {"done": ends, "terminated": ends, "reward": torch.zeros(1, 8, 3, 1)}
-    gravity = levels["gravity"].expand(3, 1, 8).permute(1, 2, 0)
-    rollout = TensorDict({"gravity": gravity, "next": after}, [1, 8, 3])
+    ends = torch.ones(8, 3, 1, dtype=torch.bool)
+    after = {"done": ends, "terminated": ends, "reward": torch.zeros(8, 3, 1)}
+    rollout = TensorDict({"gravity": levels["gravity"].expand(3, 8).mT, "next": after}, [8, 3])
     teacher.observe(prl.outcome_of(rollout))
-    assert teacher.log()["mean_score"] == pytest.approx([float(levels["gravity"].mean())])
-    assert seen == [(1, 8, 3)]
+    teacher.propose(1)
+    assert teacher.log()["mean_score"] == pytest.approx(float(levels["gravity"].mean()))
+    assert seen == [(8, 3)]
 
 
 def test_a_client_says_that_its_teacher_has_ended() -> None:

@@ -26,11 +26,12 @@ class Greedy(prl.Curriculum):
     def __init__(self, space: Any) -> None:
         self.space, self.success = space, torch.full((space.size,), 0.5)
 
-    def propose(self, student: Any, count: int, streams: Any) -> prl.Batch:
+    def propose(self, student: Any, count: int, rng: Any) -> prl.Batch:
         score = self.success * (1 - self.success)
-        draw = streams[0].generator()
-        items = (score + 1e-3 * torch.rand(len(score), generator=draw)).topk(count).indices[None]
-        return prl.Batch(self.space.generate(items, []), TensorDict({"item": items}, items.shape))
+        noise = torch.rand(len(score), generator=rng.generator())
+        items = (score + 1e-3 * noise).topk(count).indices
+        levels = self.space.generate(items[None], [])[0]
+        return prl.Batch(levels, TensorDict({"item": items}, [count]))
 
     def observe(self, student: Any, batch: prl.Batch, outcome: Any) -> None:
         self.success[batch.notes["item"]] = outcome["success"].float()

@@ -11,21 +11,21 @@ from typing import Any
 
 import pytest
 import torch
-from proposer_rl.curricula.continued import ContinuedLevels, outcome_of_episodes
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
 from proposer_rl.curricula import (
     Batch,
     Curriculum,
-    Inbox,
     ReplayCurriculum,
     ReplayRule,
     Scorer,
     Student,
     TaskStudent,
 )
-from proposer_rl.curricula.batches import fresh_levels
+from proposer_rl.curricula.contract import outcome_of_episodes
 from proposer_rl.experiment import Experiment, ScheduleSettings
+from proposer_rl.experiment.continued import ContinuedLevels
+from proposer_rl.experiment.side_by_side import SideBySide
 from proposer_rl.learning import PPOSettings, RolloutCollector, SolverSettings
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.settings import ArgumentError
@@ -55,16 +55,16 @@ class Kept(Curriculum):
     """Levels of the target; remembers what it has proposed and observed."""
 
     def __init__(self) -> None:
-        self.inbox, self.proposed = Inbox(), []
+        self.proposed: list[Any] = []
         self.observed: list[tuple[Batch, TensorDictBase]] = []
 
-    def propose(self, student: Student, count: int, streams: Any) -> Batch:
-        self.proposed.append(fresh_levels(TASK.target, count, streams, "levels"))
-        return self.inbox.batch(self.proposed[-1])
+    def propose(self, student: Student, count: int, rng: Streams) -> Batch:
+        levels = TASK.target.sample(count, rng.generator("levels"))
+        self.proposed.append(levels)
+        notes = {"number": torch.full((count,), len(self.proposed)), "place": torch.arange(count)}
+        return Batch(levels, TensorDict(notes, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        self.inbox.check(batch, outcome)
-        self.inbox.put(batch, reached=outcome["return"])
         self.observed.append((batch, outcome))
 
 
@@ -84,17 +84,15 @@ def played(level: TensorDictBase, actions: list[int]) -> tuple[float, bool]:
 def test_each_episode_is_credited_to_its_level() -> None:
     """Replica by replica and environment by environment, with queues that are plain lists."""
     learner = TASK.learner([Streams(seed) for seed in SEEDS])
-    curriculum, updates = Kept(), 14
-    levels = ContinuedLevels(
-        curriculum, TaskStudent(TASK, learner), learner, TASK.evaluated_on["target"]
-    )
+    curricula, updates = [Kept() for _ in SEEDS], 14
+    sides, like = SideBySide(TASK, learner, curricula), TASK.evaluated_on["target"][0]
+    levels = ContinuedLevels(curricula, sides.students, learner, like)
     rollouts, sizes = [], []
     for update in range(updates):
         result, credits = levels.update([Streams(seed, update) for seed in SEEDS])
-        for credit in credits:
-            curriculum.observe(TaskStudent(TASK, learner), *credit)
+        sides.observe(credits)
         rollouts.append(result.rollout)
-        sizes.append(curriculum.proposed[-1].shape[1])
+        sizes += [len(curriculum.proposed[-1]) for curriculum in curricula]
     whole: Any = torch.cat(rollouts, 2)
     expected: dict[tuple[int, int], tuple[float, bool, int]] = {}  # by replica and level's seed
     for k in range(K):
@@ -103,7 +101,7 @@ def test_each_episode_is_credited_to_its_level() -> None:
         since = [0] * P
         for t in range(updates * T):
             if t % T == 0:  # a proposal; of what is left over the newest P stay
-                proposed = curriculum.proposed[t // T][k]
+                proposed = curricula[k].proposed[t // T]
                 queue = queue[-P:] + [level.unsqueeze(0) for level in proposed]
             if t == 0:
                 now = [queue.pop(0) for _ in range(P)]
@@ -114,40 +112,41 @@ def test_each_episode_is_credited_to_its_level() -> None:
                     expected.setdefault((k, seed), (*played(now[p], actions), len(actions)))
                     now[p], since[p] = queue.pop(0) if queue else now[p], t + 1
     seen: Counter[tuple[int, int]] = Counter()
-    for batch, outcome in curriculum.observed:
-        for k in range(K):
-            for m in range(batch.count):
-                key = k, int(batch.levels["seed"][k, m])
+    for k, curriculum in enumerate(curricula):
+        for batch, outcome in curriculum.observed:
+            for m in range(len(batch)):
+                key = k, int(batch.levels["seed"][m])
                 seen[key] += 1
                 total, success, steps = expected[key]
-                assert float(outcome["return"][k, m]) == pytest.approx(total, abs=1e-5)
-                assert float(outcome["success"][k, m]) == success
-                assert int(outcome["steps"][k, m]) == steps
+                assert float(outcome["return"][m]) == pytest.approx(total, abs=1e-5)
+                assert float(outcome["success"][m]) == success
+                assert int(outcome["steps"][m]) == steps
+            places = batch.notes["place"]
+            assert (places.diff() > 0).all() and (batch.notes["number"].diff() == 0).all()
     assert max(seen.values()) == 1
     assert len(seen) > 0.6 * len(expected)  # the rest is outstanding, or left out
     lengths = [steps for _, _, steps in expected.values()]
     assert max(lengths) == LIMIT > T > min(lengths)
     assert len({*sizes}) > 2  # as many levels as episodes end
-    # In the order of the proposals, whatever the order in which they have come in.
-    numbers = [int(part["number"][0, 0]) for part in curriculum.inbox.take()]
-    assert numbers == sorted(numbers)
 
 
 def test_what_an_episode_gives_does_not_depend_on_those_beside_it() -> None:
     """Episodes of several lengths are filled up to one rollout; what fills them counts nowhere."""
     learner = TASK.learner([Streams(0)])
     student = TaskStudent(TASK, learner)
-    levels, draws = TASK.evaluated_on["target"][: 2 * P].unsqueeze(0), torch.Generator()
-    whole = torch.cat([student.play(some, [draws]) for some in levels.split(P, 1)], 1)
-    ends = whole["next", "done"][0].squeeze(-1).long().argmax(-1) + 1
-    episodes = [whole[0, place, :end].clone() for place, end in enumerate(ends.tolist())]
+    levels, draws = TASK.evaluated_on["target"][: 2 * P], torch.Generator()
+    whole: Any = torch.cat([student.play(some, draws) for some in levels.split(P)])
+    ends = whole["next", "done"].squeeze(-1).long().argmax(-1) + 1
+    episodes: list[Any] = [whole[place, :end].clone() for place, end in enumerate(ends.tolist())]
     assert len({*ends.tolist()}) > 1
-    together = outcome_of_episodes([episodes])
-    alone = [outcome_of_episodes([[episode]]) for episode in episodes]
-    assert together["steps"].tolist() == [ends.tolist()]
+    for episode in episodes:
+        episode["is_step"] = torch.ones(len(episode), dtype=torch.bool)
+    together = outcome_of_episodes(episodes)
+    alone = [outcome_of_episodes([episode]) for episode in episodes]
+    assert together["steps"].tolist() == ends.tolist()
     norms = [student.policy_gradient_norms(outcome["rollout"]) for outcome in alone]
     found_norms = student.policy_gradient_norms(together["rollout"])
-    torch.testing.assert_close(found_norms, torch.cat(norms, 1), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(found_norms, torch.cat(norms), rtol=1e-4, atol=1e-5)
 
 
 def test_a_memory_goes_on_with_its_episode() -> None:
@@ -182,14 +181,14 @@ def test_whoever_reads_a_level_once_cannot_go_on() -> None:
 def test_others_watch_whole_episodes_elsewhere() -> None:
     """What a score plays leaves the episodes of the training where they are."""
     learner = TASK.learner([Streams(seed) for seed in SEEDS])
-    student = TaskStudent(TASK, learner)
+    student = TaskStudent(TASK, learner, 1)
     assert isinstance(learner.collector, RolloutCollector)
-    levels = torch.stack([TASK.evaluated_on["target"][:2]] * K)
+    levels = TASK.evaluated_on["target"]
     generators = [torch.Generator().manual_seed(seed) for seed in SEEDS]
-    learner.env.set_levels(torch.stack([TASK.evaluated_on["target"][:P]] * K))
+    learner.env.set_levels(torch.stack([levels[:P]] * K))
     before = learner.collect(generators)
-    rollout = student.play(levels, generators)
-    assert rollout.shape == (K, 2, max(LIMIT, T)) and rollout["next", "done"].any(2).all()
+    rollout = student.play(levels[:2], generators[0])
+    assert rollout.shape == (2, max(LIMIT, T)) and rollout["next", "done"].any(1).all()
     after = learner.collect(generators)
     going_on = ~before["next", "done"][:, :, -1, 0]
     assert torch.equal(
@@ -214,13 +213,12 @@ def remembering() -> Any:
 def experiment(folder: Path, updates: int, task: Any) -> Experiment:
     learner = task.learner([Streams(seed, "solver") for seed in SEEDS])
     rule = ReplayRule(prioritization="rank", temperature=0.3, best=None, staleness=0.1)
-    curriculum = ReplayCurriculum(
-        task.space, Scorer("positive_value_loss", "episodes"), rule, capacity=8
-    )
+    scorer = Scorer("positive_value_loss", "episodes")
+    curricula = [ReplayCurriculum(task.space, scorer, rule, capacity=8) for _ in SEEDS]
     return Experiment(
         task,
         learner,
-        curriculum,
+        curricula,
         schedule=ScheduleSettings(
             updates=updates,
             cycle_length=5,
