@@ -98,10 +98,10 @@ def test_a_frozen_proposer_sees_what_it_has_learnt_with(train, capsys) -> None:
     assert said in capsys.readouterr().err
     assert train(*arguments, "schedule.updates=1") == 0
     # The checkpoint moves on, and the Proposer that this run began with does not.
-    began = load_latest(Path("run/checkpoints"))[1]["curriculum"]["proposer"]
+    began = load_latest(Path("run/checkpoints"))[1]["curricula"][0]["proposer"]
     assert train("+method=perf_gain", *SMOKE, "hydra.run.dir=learnt", "schedule.updates=4") == 0
     assert train(*arguments, "schedule.updates=2") == 0
-    ended = load_latest(Path("run/checkpoints"))[1]["curriculum"]["proposer"]
+    ended = load_latest(Path("run/checkpoints"))[1]["curricula"][0]["proposer"]
     for name, entry in began.items():
         assert torch.equal(entry["value"], ended[name]["value"])
 

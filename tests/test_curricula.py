@@ -32,12 +32,12 @@ from tests.meta.test_env import SPACE, TASK, E, K, L, P, learners, meta_env, mix
 HELD = {"mix": True, "meta_episode_length": 4, "action_repeat": 2}
 
 
-def cycle(number: int) -> list[Streams]:
-    return [Streams(0, "cycle", number)]
+def cycle(number: int) -> Streams:
+    return Streams(0, "cycle", number)
 
 
-def update(number: int) -> list[Streams]:
-    return [Streams(0, "update", number)]
+def update(number: int) -> Streams:
+    return Streams(0, "update", number)
 
 
 def student() -> TaskStudent:
@@ -85,7 +85,7 @@ def test_a_proposer_may_begin_within_a_cycle() -> None:
     curriculum.improve(student(), cycle(0))
     for updates in range(3):
         batch = curriculum.propose(student(), P, cycle(updates))
-        assert batch.levels.batch_size == (1, P)
+        assert batch.levels.batch_size == (P,)
     assert stages[1].state_dict()["proposed"] == 2
 
 
@@ -129,7 +129,7 @@ def test_a_restored_proposer_proposes_and_improves_alike(options: dict) -> None:
     came = []
     for curriculum in (original, resumed):
         # Where an action holds for two updates, that of the second is the first's.
-        levels = [curriculum.propose(solver, P, update(number)).levels for number in (1, 2)]
+        levels = [curriculum.propose(solver, P, update(number)) for number in (1, 2)]
         came.append((levels, curriculum.improve(solver, cycle(1)), weights(curriculum)))
     (levels, metrics, learnt), (other_levels, other_metrics, other_learnt) = came
     assert all((one == other).all() for one, other in zip(levels, other_levels, strict=True))
@@ -167,8 +167,8 @@ def test_a_frozen_one_proposes_what_was_learnt_and_learns_no_more(own: str) -> N
     before = weights(learnt)
     assert loaded.improve(solver, cycle(0)) == {}
     for number in range(3):
-        expected = learnt.propose(solver, P, update(number)).levels
-        assert (loaded.propose(solver, P, update(number)).levels == expected).all()
+        expected = learnt.propose(solver, P, update(number))
+        assert (loaded.propose(solver, P, update(number)) == expected).all()
     assert (weights(learnt) == before).all()
 
 

@@ -33,7 +33,7 @@ from proposer_rl.runs.checkpoint import CheckpointError, load_latest
 from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl
 from proposer_rl.runs.process import Interrupted, StopSignals
 from proposer_rl.streams import Streams
-from proposer_rl.task import NoSuccessError, Task
+from proposer_rl.task import Levels, NoSuccessError, Task
 from proposer_rl.teaching import Teacher
 from tests.curricula.made import MADE
 from tests.same_run import StopAt, assert_same_run
@@ -56,7 +56,7 @@ def experiment(
     return Experiment(
         task,
         learner(*seeds, task=task),
-        curriculum or SamplingCurriculum(task.target),
+        [curriculum or SamplingCurriculum(task.target) for _ in seeds],
         schedule=ScheduleSettings(**{"threshold": 0.1, **LENGTHS, **lengths}),
         seeds=seeds,
         folder=RunFolder(path),
@@ -102,7 +102,7 @@ def test_a_teacher_in_a_plain_loop_trains_the_same_solvers(tmp_path: Path) -> No
     for update in range(8):
         solvers.env.set_levels(teacher.propose(P).unsqueeze(0))
         actions = Streams(7, "update", update).generator("actions")
-        teacher.observe(outcome_of(solvers.update([actions]).rollout))
+        teacher.observe(outcome_of(solvers.update([actions]).rollout[0]))
     assert (run.learner.snapshot() == solvers.snapshot()).all()
     assert 0 < teacher.log()["replayed"] < 1
 
@@ -131,18 +131,18 @@ class Costly(LearnedCurriculum):
         self.target = SamplingCurriculum(TASK.target)
         self.observed = 0
 
-    def propose(self, student, count, streams) -> Batch:
+    def propose(self, student, count, rng) -> Levels:
         self.events.append(("propose", count))
         student.spend(frames=10, evaluations=1)
-        return self.target.propose(student, count, streams)
+        return self.target.propose(student, count, rng)
 
     def observe(self, student, batch, outcome) -> None:
-        assert batch.levels.batch_size == (1, P) == outcome.batch_size
-        assert outcome["rollout"].batch_size == (1, P, T)
+        assert batch.levels.batch_size == (P,) == outcome.batch_size
+        assert outcome["rollout"].batch_size == (P, T)
         self.events.append(("observe",))
         self.observed += 1
 
-    def improve(self, student, streams) -> dict:
+    def improve(self, student, rng) -> dict:
         self.events.append(("improve",))
         student.spend(frames=1000, evaluations=100)
         return {"own": ["improved"]}
@@ -163,7 +163,7 @@ def test_a_student_that_lacks_something_is_refused_before_anything_is_written(
         Experiment(
             cars,
             cars.learner([Streams(0)]),
-            Demanding(cars.space),
+            [Demanding(cars.space)],
             schedule=ScheduleSettings(**LENGTHS, headline=cars.metrics[0], threshold=0.5),
             seeds=[0],
             folder=RunFolder(tmp_path / "run"),
@@ -211,14 +211,14 @@ def test_an_improvement_that_cost_frames_is_saved_at_once(tmp_path: Path) -> Non
     class Silent(Costly):
         crashes = False
 
-        def improve(self, student, streams) -> dict:
-            super().improve(student, streams)
+        def improve(self, student, rng) -> dict:
+            super().improve(student, rng)
             return {}
 
-        def propose(self, student, count, streams) -> Batch:
+        def propose(self, student, count, rng) -> Levels:
             if self.crashes:
                 raise RuntimeError("the machine is switched off")
-            return super().propose(student, count, streams)
+            return super().propose(student, count, rng)
 
     first, again = Silent(), Silent()
     first.crashes = True
@@ -287,15 +287,15 @@ class Stopped(Costly):
         self.signals = signals
         self.begun = torch.zeros(())
 
-    def improve(self, student, streams) -> dict:
+    def improve(self, student, rng) -> dict:
         # What is begun here must be undone, also what has changed in place.
         self.begun += 1
-        levels = TASK.target.sample(P, streams[0].generator("levels"))[None]
-        student.train(levels, [streams[0].generator("actions")])
+        student._learner.env.set_levels(TASK.target.sample(P, rng.generator("levels"))[None])
+        student._learner.update([rng.generator("actions")])
         if self.begun == 2 and self.signals is not None:
             os.kill(os.getpid(), SIGTERM)
             self.signals.check()
-        return super().improve(student, streams)
+        return super().improve(student, rng)
 
 
 @pytest.mark.parametrize("handled", [False, True])
@@ -307,7 +307,7 @@ def test_a_signal_within_an_improvement_undoes_what_was_begun(
     run = experiment(tmp_path / "run", 0, curriculum=Stopped(signals), signals=signals)
 
     def goes_on(*_: object) -> None:
-        run.curriculum.signals = None
+        run.sides.curricula[0].signals = None
 
     before = signal(SIGTERM, goes_on if handled else SIG_DFL)
     try:

@@ -102,10 +102,10 @@ def test_a_mixture_is_what_its_methods_propose_by_themselves() -> None:
     }
     made = mixture(ON_RANGES, parts)
     assert made.needs == () and made.required_results == ("success",)
-    drawn = made.propose(Student(), 40, [Streams(0)]).levels["x"][0]
+    drawn = made.propose(Student(), 40, Streams(0)).levels["x"]
     assert (drawn[:10] == 1).all()
-    alone = SamplingCurriculum(RANGES).propose(Student(), 20, [Streams(0, "part", 1)])
-    assert (drawn[10:30] == alone.levels["x"][0]).all()
+    alone = SamplingCurriculum(RANGES).propose(Student(), 20, Streams(0, "part", 1))
+    assert (drawn[10:30] == alone["x"]).all()
     assert (drawn[30:] * 8).long().bincount(minlength=8).tolist().count(1) == 6  # 10 in 8 bins
 
 

@@ -43,7 +43,7 @@ def test_the_papers_values_are_the_defaults_of_the_code() -> None:
 def first_cycle(*overrides: str) -> str:
     """The numbers of a first cycle: what is written of it, what came of Solver and Proposer."""
     config = composed("+method=perf_gain", "+scale=smoke", *LITTLE, *overrides)
-    task, learner, curriculum = parts(config, StopSignals())
+    task, learner, (curriculum,) = parts(config, StopSignals())
     student = TaskStudent(task, learner)
     assert isinstance(curriculum, ProposerCurriculum) and curriculum.trainer is not None
     metrics = curriculum.improve(student, [Streams(0, "cycle", 0)])
@@ -148,7 +148,7 @@ def test_what_is_exact_has_a_sampled_twin(method: str) -> None:
     costs = {}
     for options in ((), ("+score=sampled",)):
         config = composed(f"+method={method}", "+scale=smoke", *LITTLE, *options)
-        task, learner, curriculum = parts(config, StopSignals())
+        task, learner, (curriculum,) = parts(config, StopSignals())
         student = TaskStudent(task, learner)
         curriculum.propose(student, task.batch_size, [Streams(0, "update", 0)])
         costs[options] = (student.frames > 0, student.evaluations > 0)

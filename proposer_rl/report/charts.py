@@ -19,7 +19,7 @@ from proposer_rl.report.runs import Run, share_map
 from proposer_rl.report.statistics import median_of
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.runs.folder import is_rate
-from proposer_rl.runs.records import LevelRecord, Record, number, picture
+from proposer_rl.runs.records import LevelRecord, number, picture
 
 Json = Any
 DIGITS = 5
@@ -143,7 +143,7 @@ def _stages(study: Study) -> dict[str, Json] | None:
     runs = [
         next((run for run in group.runs if run.samples), None)
         or next(
-            (run for run in group.runs if any(like.shares(c) is not None for c in _cycles(run))),
+            (run for run in group.runs if any(like.shares(c) is not None for c in run.cycles)),
             None,
         )
         for group in study.groups
@@ -175,7 +175,7 @@ def _method(run: Run, study: Study, most: int, pictures: dict[str, int]) -> dict
     moments: list[tuple[int, Sequence[LevelRecord]]] = [(s.updates, s.levels) for s in run.samples]
     if not moments:
         moments = [
-            (updates, ()) for updates in sorted({int(number(c["updates"])) for c in _cycles(run)})
+            (updates, ()) for updates in sorted({int(number(c["updates"])) for c in run.cycles})
         ]
     last = len(moments) - 1
     chosen = np.unique(np.linspace(0, last, min(most, len(moments))).round()).astype(int)
@@ -192,11 +192,6 @@ def _method(run: Run, study: Study, most: int, pictures: dict[str, int]) -> dict
             for i in chosen
         ],
     }
-
-
-def _cycles(run: Run) -> list[Record]:
-    """Returns a run's cycles without those that are marked as another seed's."""
-    return [cycle for cycle in run.cycles if number(cycle.get("seed", run.seed)) == run.seed]
 
 
 def _level(level: LevelRecord, pictures: dict[str, int]) -> Json:
@@ -223,7 +218,7 @@ def _map(run: Run, like: Run, updates: int) -> Json:
     """Returns the shares of proposals that were last recorded up to that update; None without."""
     shares = [
         found
-        for cycle in _cycles(run)
+        for cycle in run.cycles
         if number(cycle["updates"]) <= updates and (found := like.shares(cycle)) is not None
     ]
     return [plain(row) for row in share_map(shares[-1])] if shares else None

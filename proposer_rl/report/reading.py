@@ -199,7 +199,7 @@ def _runs(
             finished=False,
             metrics=_of_seed(metrics, seed),
             training=_of_seed(training, seed),
-            cycles=cycles,
+            cycles=[row for row in cycles if row.get("seed", seed) == seed],
             samples=[sample for sample in samples if sample.seed == seed],
             sheets=_last_sheets(cycles, sheets, seed),
         )

@@ -200,6 +200,11 @@ class Run:
         x, y = np.append(x[inside], budget), np.append(y[inside], end)
         return float(np.trapezoid(y, x) / (x[-1] - x[0])) if len(x) > 1 else end
 
+    @property
+    def whose_cycles(self) -> tuple[Path, Any]:
+        """What tells its cycles from another run's: its folder and, where they have one, a seed."""
+        return self.folder, self.cycles[0].get("seed") if self.cycles else None
+
     def shares(self, cycle: Record) -> Column | None:
         """Returns a cycle's shares of proposals, a dimension for each axis; None if unrecorded."""
         sides = tuple(len(values) for values in self.task.space.values())
@@ -228,12 +233,12 @@ def tables(runs: Iterable[tuple[str, Run]], key: str = "run") -> dict[str, pd.Da
         By their names; those without rows are left out.
     """
     found: dict[str, list[pd.DataFrame]] = {name: [] for name in NAMES}
-    seen: set[Path] = set()
+    seen: set[Any] = set()
     for name, run in runs:
         place = {key: name, "seed": run.seed}
         for table, own in (("metrics", run.metrics), ("training", run.training)):
             found[table].append(pd.DataFrame(place, own.index).join(own))
-        if run.folder not in seen:  # seeds that were trained together have one curriculum
+        if run.whose_cycles not in seen:
             whose = {key: name} if key == "run" else place
             cells = (
                 {k: json.dumps(v) for k, v in cycle.items() if v is not None and v == v}
@@ -241,7 +246,7 @@ def tables(runs: Iterable[tuple[str, Run]], key: str = "run") -> dict[str, pd.Da
             )
             # A curriculum may log a number of that name: a row stays its run's.
             found["cycles"].append(pd.DataFrame([whose | cycle | {key: name} for cycle in cells]))
-        seen.add(run.folder)
+        seen.add(run.whose_cycles)
         for distribution in dict.fromkeys(name.rpartition("_")[0] for name in run.levels):
             # Of returns what is shown: the headline, and where there is no success.
             kinds = [

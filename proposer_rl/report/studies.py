@@ -58,8 +58,8 @@ class Group:
 
     @property
     def logs(self) -> list[Run]:
-        """A run of each folder: seeds that were trained together have one curriculum's cycles."""
-        return list({run.folder: run for run in self.runs if run.cycles}.values())
+        """The runs whose cycles differ; seeds that were trained together may have the same ones."""
+        return list({run.whose_cycles: run for run in self.runs if run.cycles}.values())
 
 
 @dataclass(frozen=True)

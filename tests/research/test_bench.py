@@ -193,7 +193,7 @@ def test_what_is_measured_is_what_a_run_would_be() -> None:
         assert torch.get_num_threads() == 2
     assert made.task.batch_size == 16 and made.task.precision == "bf16"
     assert made.learner.env.batch_size == (1, 16)
-    assert made.curriculum.trainer.env.batch_size == (3,)
+    assert made.curricula[0].trainer.env.batch_size == (3,)
 
 
 def test_the_plain_way_learns_the_same_numbers() -> None:

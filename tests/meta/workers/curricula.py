@@ -61,10 +61,10 @@ def cycles(
     numbers: list[float] = []
     for cycle in range(count):
         student = TaskStudent(task, solver)
-        metrics = curriculum.improve(student, [Streams(0, "cycle", cycle)])
+        metrics = curriculum.improve(student, Streams(0, "cycle", cycle))
         stream = Streams(0, "update", cycle)
-        levels = curriculum.propose(student, task.batch_size, [stream]).levels
-        solver.env.set_levels(levels)
+        levels = curriculum.propose(student, task.batch_size, stream)
+        solver.env.set_levels(levels.unsqueeze(0))
         update = solver.update([stream.generator("actions")])
         chosen += [metrics.pop("histogram"), student.frames, student.evaluations, metrics.keys()]
         chosen += [levels.to_text(), update.rollout["action"].tolist()]
