@@ -46,6 +46,7 @@ from proposer_rl.curricula.belief import Belief
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.outcome_model import Predictions
 from proposer_rl.curricula.student import Student
+from proposer_rl.meta.assembly import Components
 from proposer_rl.settings import Count, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space, level_inputs
@@ -135,6 +136,11 @@ class AdaptiveMixture(Curriculum):
         self._seen = Predictions()
         self._some: dict[str, Levels] = {}  # of the last levels, by their arms
         self._shown: dict[str, Any] = {}
+
+    @classmethod
+    def create(cls, run: Components, **settings: Any) -> AdaptiveMixture:
+        """Makes it for a run's space, and its target and inputs if it has any."""
+        return cls(run.task.space, run.optional("target"), run.optional("inputs"), **settings)
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """Returns levels [K, n] of the three arms, in a random order."""

@@ -37,6 +37,7 @@ from proposer_rl.curricula.batches import (
     unpacked,
 )
 from proposer_rl.curricula.buffer import (
+    Prioritization,
     ReplayRule,
     draw_slots,
     empty_buffer,
@@ -46,10 +47,11 @@ from proposer_rl.curricula.buffer import (
     rescore,
 )
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
-from proposer_rl.curricula.scores import Scored, Scorer, episodes, unseen
+from proposer_rl.curricula.scores import OwnScore, Scored, Scorer, Source, episodes, unseen
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import DivergedError
-from proposer_rl.settings import ArgumentError, Count, Positive, checked
+from proposer_rl.meta.assembly import Components
+from proposer_rl.settings import ArgumentError, Count, Positive, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space
 
@@ -100,6 +102,7 @@ class ReplayCurriculum(Curriculum):
         space: Distribution,
         scorer: Scorer,
         rule: ReplayRule | None = None,
+        edit: Edit | None = None,
         *,
         new_levels: dict[str, Annotated[list[float], Len(1)]] | None = None,
         capacity: Count = 4000,
@@ -108,7 +111,6 @@ class ReplayCurriculum(Curriculum):
         train_on_new: bool = False,
         synchronous: bool | None = None,
         edits: Annotated[int, Interval(ge=0, le=1_000_000)] = 0,
-        edit: Edit | None = None,
         parents: Parents = "batch",
         renew: bool = False,
         co_learnability: float = 0.0,
@@ -156,6 +158,27 @@ class ReplayCurriculum(Curriculum):
         self._scored = 0  # new levels of each student
         self._came_back = {"levels": 0, "replayed": 0}
         self.check(len(seeds))
+
+    @classmethod
+    def create(
+        cls,
+        run: Components,
+        *,
+        score: str | OwnScore = "positive_value_loss",
+        source: Source = "episodes",
+        rollouts: Count = 1,
+        prioritization: Prioritization = ReplayRule.prioritization,
+        temperature: Positive = ReplayRule.temperature,
+        best: Count | None = ReplayRule.best,
+        staleness: Share = ReplayRule.staleness,
+        **settings: Any,
+    ) -> ReplayCurriculum:
+        """Makes it for a run's space and edits: see :class:`Scorer` and :class:`ReplayRule`."""
+        rule = ReplayRule(
+            prioritization=prioritization, temperature=temperature, best=best, staleness=staleness
+        )
+        parts = run.task.space, Scorer(score, source, rollouts), rule, run.optional("edit")
+        return cls(*parts, seeds=run.seeds, **settings)
 
     def check(self, students: int) -> None:
         """Refuses several students, if each would decide by itself how many new levels to score.

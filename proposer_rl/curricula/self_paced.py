@@ -16,6 +16,7 @@ from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum, Inbox
 from proposer_rl.curricula.points import Place, Points
 from proposer_rl.curricula.student import Student
+from proposer_rl.meta.assembly import Components
 from proposer_rl.settings import Count, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Space
@@ -101,6 +102,12 @@ class SelfPacedCurriculum(Curriculum):
         self._expected: list[float] = []  # performance at the last step, of each student
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._inbox = Inbox()
+
+    @classmethod
+    def create(cls, run: Components, **settings: Any) -> SelfPacedCurriculum:
+        """Makes it for a run's space, its target and the shares of the bins in that."""
+        task = run.task
+        return cls(task.space, task.target, task.target_shares, **settings)
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """Draws points from the Gaussians, and returns levels [K, n] there."""

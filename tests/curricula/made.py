@@ -87,9 +87,8 @@ def paired(streams: Streams | None = None) -> PairedProposer:
 
 
 def first_order_proposer() -> FirstOrderProposer:
-    return FirstOrderProposer(
-        SPACE, TARGET, problem_agent(), SETTINGS, probe_levels=2, target_levels=3
-    )
+    numbers = {"probe_levels": 2, "target_levels": 3, "step": 1.0, "measure": "log_success"}
+    return FirstOrderProposer(SPACE, TARGET, problem_agent(), SETTINGS, **numbers)
 
 
 def learnt() -> ProposerCurriculum:
