@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from small_mazes import report, small_task, train
@@ -39,9 +40,14 @@ class Again(Curriculum):
     state = ("_inbox",)  # what a resumed run needs
 
     @checked
-    def __init__(self, fresh: Distribution, probability: Share) -> None:
+    def __init__(self, fresh: Distribution, *, probability: Share = 0.5) -> None:
         self._fresh, self._probability = fresh, probability
         self._inbox = Inbox(like=fresh.sample(1, torch.Generator())[0])
+
+    @classmethod
+    def create(cls, run: Components, **settings: Any) -> Again:
+        """What it takes of a run of the command line: the target."""
+        return cls(run.task.target, **settings)
 
     def propose(self, student: Student, count: int, streams: Sequence[Streams]) -> Batch:
         """Levels [K, n]; Solver k's draws come from its own streams."""
@@ -60,15 +66,10 @@ class Again(Curriculum):
         self._inbox.put(batch, level=batch.levels, failed=outcome["success"] == 0)
 
 
-def again(components: Components, probability: Share) -> Curriculum:
-    """The factory that the configuration names: from a run's components to its curriculum."""
-    return Again(components.task.target, probability)
-
-
 def main(updates: int = 60) -> None:
     """Train a Solver on the target, half of the failed levels once more."""
     task = small_task()
-    report(train(task, Again(task.target, 0.5), updates))
+    report(train(task, Again(task.target), updates))
 
 
 if __name__ == "__main__":

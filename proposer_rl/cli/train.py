@@ -26,15 +26,8 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from proposer_rl.cli.errors import UNFORESEEN, ConfigError, command, exit_code, one_line, refuse
-from proposer_rl.cli.groups import (
-    arranged,
-    check_chosen,
-    check_groups,
-    explained,
-    given_overrides,
-    invocation,
-)
-from proposer_rl.recipes import CONFIG_FOLDER, override
+from proposer_rl.cli.groups import arranged, check_chosen, check_groups, invocation, quoted
+from proposer_rl.recipes import CONFIG_FOLDER, explained
 from proposer_rl.runs.folder import FAILURE, RunFolder
 from proposer_rl.runs.process import InUseError, StopSignals, guard_output
 
@@ -101,7 +94,7 @@ def _main(hydra_config: DictConfig) -> float:
     signals = StopSignals()
     try:
         (path / FAILURE).unlink(missing_ok=True)  # a run that failed is tried again
-        asked = invocation(about, given_overrides(about), path)
+        asked = invocation(about, path)
         check_groups(asked.overrides)
         check_chosen(hydra_config, about)
         with signals:  # already now: amid imports is no place to stop
@@ -149,7 +142,7 @@ def _expanded(config: DictConfig, key: str) -> Path:
     if given.startswith("~"):
         with read_write(config.hydra), open_dict(config.hydra):
             OmegaConf.update(config, key, str(path))
-            config.hydra.overrides.hydra.append(override(key, path))  # for a sweep's jobs
+            config.hydra.overrides.hydra.append(quoted(key, str(path)))  # for a sweep's jobs
     return path.absolute()
 
 

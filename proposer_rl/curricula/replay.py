@@ -103,6 +103,7 @@ class ReplayCurriculum(Curriculum):
         scorer: Scorer,
         rule: ReplayRule | None = None,
         edit: Edit | None = None,
+        seeds: Sequence[int] = (0,),
         *,
         new_levels: dict[str, Annotated[list[float], Len(1)]] | None = None,
         capacity: Count = 4000,
@@ -114,7 +115,6 @@ class ReplayCurriculum(Curriculum):
         parents: Parents = "batch",
         renew: bool = False,
         co_learnability: float = 0.0,
-        seeds: Sequence[int] = (0,),
     ) -> None:
         synchronous = not train_on_new if synchronous is None else synchronous
         if train_on_new and synchronous:
@@ -177,8 +177,8 @@ class ReplayCurriculum(Curriculum):
         rule = ReplayRule(
             prioritization=prioritization, temperature=temperature, best=best, staleness=staleness
         )
-        parts = run.task.space, Scorer(score, source, rollouts), rule, run.optional("edit")
-        return cls(*parts, seeds=run.seeds, **settings)
+        scorer = Scorer(score, source, rollouts)
+        return cls(run.task.space, scorer, rule, run.optional("edit"), run.seeds, **settings)
 
     def check(self, students: int) -> None:
         """Refuses several students, if each would decide by itself how many new levels to score.

@@ -33,6 +33,7 @@ from proposer_rl.curricula import (
 )
 from proposer_rl.learning import PPOSettings
 from proposer_rl.meta.assembly import ProposerSettings
+from proposer_rl.meta.rewards import log_success_gain
 from proposer_rl.methods import Components, proposer
 from proposer_rl.models import (
     ActorCritic,
@@ -96,7 +97,7 @@ def learnt() -> ProposerCurriculum:
     settings = ProposerSettings(
         rollouts=2, meta_episode_length=2, action_repeat=1, validation_levels=4, probe_levels=2
     )
-    return proposer(Components(TASK, settings, [0]))
+    return proposer(Components(TASK, settings, [0]), reward=log_success_gain)
 
 
 def frozen() -> ProposerCurriculum:

@@ -59,4 +59,4 @@ def test_it_has_no_second_solver_whose_episodes_go_on() -> None:
     task = walk_task(solver=SolverSettings(batch_size=P, ppo=ppo))
     components = Components(task, ProposerSettings(), [0])
     with pytest.raises(ArgumentError, match=r"^continue_episodes=True: the second Solver"):
-        methods.paired(components, 1, 1e-3, 0.1)
+        methods.paired(components)
