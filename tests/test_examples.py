@@ -95,14 +95,14 @@ def failures(probability: float, example: Load) -> tuple[Level, Tensor, Level]:
     task = example("small_mazes").small_task()
     solver = task.learner([Streams(0, "solver")])
     make = example("own_curriculum").Again
-    curriculum = make(task.target, probability)
+    curriculum = make(task.target, probability=probability)
     student = TaskStudent(task, solver)
     batch = curriculum.propose(student, 32, [Streams(0)])
     levels = batch.levels
     solver.env.set_levels(levels)
     update = solver.update([torch.Generator().manual_seed(0)])
     curriculum.observe(student, batch, outcome_of(update.rollout))
-    resumed = make(task.target, probability)
+    resumed = make(task.target, probability=probability)
     resumed.load_state_dict(curriculum.state_dict())
     following = [c.propose(student, 32, [Streams(1)]).levels for c in (curriculum, resumed)]
     assert (following[0] == following[1]).all()
