@@ -11,7 +11,8 @@ import json
 import os
 import sys
 import traceback
-from argparse import ArgumentParser
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from yaml import YAMLError
 
 from proposer_rl.cli.errors import UNFORESEEN, ConfigError, command, exit_code, one_line, refuse
 from proposer_rl.cli.groups import arranged, check_chosen, check_groups, invocation, quoted
-from proposer_rl.recipes import CONFIG_FOLDER, explained
+from proposer_rl.recipes import CONFIG_FOLDER, composed, explained, plain_values
 from proposer_rl.runs.folder import FAILURE, RunFolder
 from proposer_rl.runs.process import InUseError, StopSignals, guard_output
 
@@ -132,7 +133,22 @@ def _prepare_arguments() -> None:
             "as in: --config-dir my_conf task=hill"
         )
     options = [word for word in sys.argv[1:] if word not in read.overrides]
-    sys.argv[1:] = [*arranged(read.overrides), *options]
+    overrides = arranged(read.overrides)
+    if read.cfg == "job":
+        more = Path(read.config_dir).absolute() if read.config_dir else CONFIG_FOLDER
+        _show_settings([*overrides, f'hydra.searchpath=["file://{more}"]'], read)
+        sys.exit()
+    sys.argv[1:] = [*overrides, *options]
+
+
+def _show_settings(words: Sequence[str], read: Namespace) -> None:
+    """Prints the settings that words ask for, as Hydra does, and defaults that are in no file."""
+    from proposer_rl.methods import completed  # only now: it takes seconds
+
+    config = OmegaConf.create(completed(plain_values(composed(words))))
+    part: Any = OmegaConf.select(config, read.package or "")
+    text = OmegaConf.to_yaml(part, resolve=read.resolve) if OmegaConf.is_config(part) else part
+    print(str(text).rstrip())
 
 
 def _expanded(config: DictConfig, key: str) -> Path:

@@ -250,9 +250,7 @@ def _command(run: Run) -> str:
         kept = {key: value for key, value in settings.items() if key not in ("seed", "compute")}
         given = {"task": named.pop("task", ""), "curriculum": named.pop("method"), **named}
         call = ", ".join(f"{name}={value!r}" for name, value in {**given, "settings": kept}.items())
-        return (
-            f"prl.train({call})" if run.shared_by > 1 else f"prl.train({call}, seed=seed)  # seed="
-        )
+        return f"prl.train({call}{')' if run.shared_by > 1 else ', seed=seed)  # seed='}"
     arguments = run.facts.get("arguments", {})
     paths, config = arguments.get("pythonpath"), arguments.get("config_dir")
     own = ("seed=", "seeds=", "hydra.", "+sweep=", "compute.", "logger")
