@@ -6,7 +6,7 @@ PPO's. All else is as with PPO, also the advantages against the other copies.
 
     python examples/other_loss.py [cycles]
 
-On the command line a method names the factory (examples/conf/method/a2c.yaml):
+On the command line a method is a function that takes a run (examples/conf/method/a2c.yaml):
 
     PYTHONPATH=examples bin/train --config-dir examples/conf +method=a2c +scale=quick \
         proposer.ppo.epochs=1 proposer.ppo.updates=1 proposer.ppo.learning_rate=0.01
@@ -22,7 +22,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.objectives import A2CLoss, ReinforceLoss
 
 from proposer_rl import ComputeContext, PPOSettings, SolverSettings, Streams, performance_gain
-from proposer_rl.curricula import TaskStudent
+from proposer_rl.curricula import ProposerCurriculum, TaskStudent
 from proposer_rl.learning import LearningSettings
 from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components, proposer
@@ -42,6 +42,11 @@ def reinforce(actor: TensorDictModuleBase, critic: TensorDictModule) -> Reinforc
     return ReinforceLoss(actor, critic, functional=False, reduction="none", loss_critic_type="l2")
 
 
+def a2c_proposer(run: Components) -> ProposerCurriculum:
+    """The method that the command line names."""
+    return proposer(run, a2c, reward=performance_gain)
+
+
 def main(cycles: int = 20) -> None:
     """Train a Proposer for mountain cars with each; every cycle begins with a fresh Solver."""
     torch.set_num_threads(1)
@@ -58,7 +63,8 @@ def main(cycles: int = 20) -> None:
         ppo=LearningSettings(epochs=1, gamma=1.0, learning_rate=0.02),
     )
     for loss in (a2c, reinforce):
-        curriculum = proposer(Components(task, settings, seeds=[0]), performance_gain, loss)
+        run = Components(task, settings, seed=0)
+        curriculum = proposer(run, loss, reward=performance_gain)
         for cycle in range(cycles):
             stream = Streams(0, cycle)
             student = TaskStudent(task, task.learner([stream]))

@@ -12,15 +12,15 @@ import proposer_rl as prl
 
 
 class Again(prl.Curriculum):
-    """Draws levels of a distribution, and those of the last batch that were failed on."""
+    """Draws levels of a space, and those of the last batch that were failed on."""
 
     state = ("failed",)  # what a resumed run needs
 
-    def __init__(self, target):
-        self.target, self.failed = target, target.sample(1, torch.Generator())[:0]
+    def __init__(self, space):
+        self.space, self.failed = space, space.sample(1, torch.Generator())[:0]
 
     def propose(self, student, count, rng):
-        levels = self.target.sample(count, rng.generator("levels"))
+        levels = self.space.sample(count, rng.generator("levels"))
         levels[: len(self.failed)] = self.failed[:count]
         return levels
 

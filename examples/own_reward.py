@@ -36,7 +36,7 @@ def learnability(step: TrainingStep) -> Tensor:
 def main(updates: int = 60) -> None:
     """Train a Solver on the proposals of a Proposer that is rewarded for learnability."""
     task = small_task()
-    curriculum = proposer(Components(task, proposer_settings(), seeds=[0]), reward=learnability)
+    curriculum = proposer(Components(task, proposer_settings(), seed=0), reward=learnability)
     report(train(task, curriculum, updates))
 
 

@@ -30,6 +30,7 @@ from proposer_rl.learning import PPO, LeaveOneOutBaseline, PPOSettings, SolverSe
 from proposer_rl.meta.actions import Mixture, ProblemChoices
 from proposer_rl.meta.env import SolverTrainingEnv, SolverView
 from proposer_rl.meta.rewards import log_success_gain, performance_gain, task_difficulty
+from proposer_rl.methods import filter_asked
 from proposer_rl.models import (
     ActorCritic,
     MapEncoder,
@@ -39,7 +40,7 @@ from proposer_rl.models import (
     ProposerNetwork,
     UNet,
 )
-from proposer_rl.recipes import DEFAULT_METHOD, Recipe, as_recipe, filter_content, override
+from proposer_rl.recipes import DEFAULT_METHOD, Recipe, as_recipe
 from proposer_rl.settings import ArgumentError, arguments
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
@@ -245,15 +246,10 @@ def train(
     )
     task = as_recipe("task", "task", task)
     curriculum = as_recipe("curriculum", "method", curriculum)
-    overrides = [*task.overrides(), *curriculum.overrides()]
-    if scale is not None:
-        overrides.append(f"+scale={scale}")
-    if isinstance(filter, str):
-        overrides.append(f"+filter={filter}")
-    more = {**(filter_content(filter) if isinstance(filter, Mapping) else {}), **(settings or {})}
-    overrides += [override(f"++{name}", value) for name, value in more.items()]
-    overrides += [override("seed", seed), override("compute.progress", progress)]
+    words, filtered = filter_asked(filter)
+    words = [*task.words, *curriculum.words, *([f"+scale={scale}"] if scale else []), *words]
+    more: dict[str, Any] = {"seed": seed, "compute": {"progress": progress}}
     if updates is not None:
-        overrides.append(override("schedule.updates", updates))
-    own = {**task.own(), **curriculum.own()}
-    return Run(compose_and_run(overrides, own, None if folder is None else Path(folder)))
+        more["schedule"] = {"updates": updates}
+    asked = [task.settings, curriculum.settings, filtered, more, settings or {}]
+    return Run(compose_and_run(words, asked, None if folder is None else Path(folder)))

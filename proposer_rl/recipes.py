@@ -1,32 +1,33 @@
 """Tasks and curricula by name: what ``prl.tasks.maze()`` and ``prl.curricula.plr()`` return.
 
-The names, their settings and the defaults are those of the files in ``conf/task`` and
-``conf/method``, which the command line reads, too; so both sides of the library know the same.
+The names are those of the files in ``conf/task`` and ``conf/method``, which the command line reads,
+too. Hydra composes them, and settings from Python are merged into what it has composed.
 """
 
 from __future__ import annotations
 
 import inspect
-import re
-from collections.abc import Callable, Iterator, Mapping
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, reduce
-from inspect import isfunction
+from functools import cache, lru_cache
+from inspect import Parameter, Signature
 from pathlib import Path
-from typing import Any, Literal
+from threading import RLock
+from typing import TYPE_CHECKING, Any, Literal
 
-import yaml
+from proposer_rl.extras import where_to_look
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
 
 PACKAGE = Path(__file__).resolve().parent
 # In a wheel the configuration lies in the package, in a checkout beside it.
 CONFIG_FOLDER = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"
-KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*([ -][A-Za-z_][A-Za-z0-9_]*)*")  # what Hydra takes
-CONSTANTS = {"null", "true", "false", "nan", "inf"}
 DEFAULT_METHOD = "adaptive_mixture"  # for those who do not want to choose
-MISSING = "???"  # in a file: to be given
-REFERENCE = re.compile(r"\$\{([\w.]+)\}")  # in a file: to another setting
-KEYS = {"task": ("task",), "method": ("curriculum", "model")}
-"""Below which keys of the configuration the settings of a group's files stand."""
+NO_TASK = "~task"  # the word for Hydra with which no file of a task is composed
+COMPOSING = RLock()  # Hydra composes with globals of the process
+Group = Literal["task", "method"]
 
 
 @dataclass(frozen=True)
@@ -36,76 +37,64 @@ class Recipe:
     Attributes:
         group: ``"task"`` or ``"method"``.
         name: of a file in that folder of the configuration; or of a function of one's own.
-        settings: that differ from the file's, by name; mappings are merged into those there.
-        target: dotted name of one's own class or function; None for a file's.
+        words: that Hydra composes it from, as on the command line.
+        settings: that are merged into what it has composed, by top-level key.
     """
 
-    group: Literal["task", "method"]
+    group: Group
     name: str
+    words: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
-    target: str | None = None
-
-    def overrides(self) -> list[str]:
-        """Returns the same for the command line, without what is one's own."""
-        if self.target is not None:
-            # As most tasks call what is to be mastered; a headline that is given comes after it.
-            return ["~task", "schedule.headline=target_success"] if self.group == "task" else []
-        group = "task" if self.group == "task" else "+method"
-        given = [
-            override(f"++{key}.{name}", value)
-            for key, settings in self.by_key().items()
-            for name, value in settings.items()
-        ]
-        return [f"{group}={self.name}", *given]
-
-    def by_key(self) -> dict[str, dict[str, Any]]:
-        """Returns the settings by the key of the configuration that they stand below."""
-        known = {self._key: {}} if self.target else _by_key(self.group, self.name)
-        found: dict[str, dict[str, Any]] = {}
-        for name, value in self.settings.items():
-            key = next((key for key, there in known.items() if name in there), self._key)
-            found.setdefault(key, {})[name] = value
-        return found
-
-    def own(self) -> dict[str, Any]:
-        """Returns the configuration of one's own task or curriculum, which no file has."""
-        if self.target is None:
-            return {}
-        named = {"method": self.name} if self.group == "method" else {}
-        from proposer_rl.settings import plain  # which help does without
-
-        return {**named, self._key: {"_target_": self.target, **plain(self.settings)}}
-
-    @property
-    def _key(self) -> str:
-        return KEYS[self.group][0]
 
 
-def own_recipe(
-    group: Literal["task", "method"], make: Callable[..., Any], **settings: Any
-) -> Recipe:
+def own_recipe(group: Group, make: Callable[..., Any], **settings: Any) -> Recipe:
     """Returns a recipe for a class or function of one's own, which must be importable.
 
     Args:
         group: ``"task"``, or ``"method"`` for a curriculum.
-        make: of a task, called with the settings, ``solver`` and ``context``; of a curriculum, with
-            the run's :class:`~proposer_rl.methods.Components` and the settings.
+        make: of a task, called with the settings, ``solver`` and ``context``; of a curriculum, a
+            class with ``create`` or a function, see :func:`proposer_rl.methods.build`.
         settings: numbers, texts, lists and mappings.
 
     Raises:
         ArgumentError: if it cannot be imported by its name.
     """
-    return Recipe(group, make.__name__, settings, _dotted("make", make))
+    own = {"_target_": _dotted("make", make), **settings}
+    if group == "method":
+        return Recipe(group, make.__name__, (), {"method": make.__name__, "curriculum": own})
+    # As most tasks call what is to be mastered; a headline that is given comes after it.
+    schedule = {"headline": "target_success"}
+    return Recipe(group, make.__name__, (NO_TASK,), {"task": own, "schedule": schedule})
+
+
+def storable(key: str, value: Any) -> Any:
+    """Returns a value of Python's own, see :func:`~proposer_rl.settings.plain`, for JSON.
+
+    Raises:
+        ArgumentError: naming the key, for a function that cannot be imported by its name, and for
+            what JSON has not.
+    """
+    from proposer_rl.settings import plain, shown  # which help does without
+
+    if callable(value):
+        return _dotted(key, value)
+    if isinstance(value, Mapping):
+        return {plain(name): storable(f"{key}.{name}", inner) for name, inner in value.items()}
+    try:
+        return json.loads(json.dumps(plain(value)))
+    except TypeError:
+        said = "must be a number, a text, a list or a mapping of such"
+        raise _refusal(f"{key}={shown(value)}: {said}") from None
 
 
 def _dotted(name: str, function: Any) -> str:
-    dotted = f"{function.__module__}.{function.__qualname__}"
-    if function.__module__ == "__main__" or "<" in dotted:
+    module, qualified = function.__module__, getattr(function, "__qualname__", "<nameless>")
+    if module == "__main__" or "<" in qualified:
         raise _refusal(
-            f"{name}={dotted}: must be importable, as a class or function of a module is, so that "
-            "watch, eval and play can make it again"
+            f"{name}={module}.{qualified}: must be importable, as a class or function of a module "
+            "is, so that watch, eval and play can make it again"
         )
-    return dotted
+    return f"{module}.{qualified}"
 
 
 def available(group: str, folder: Path = CONFIG_FOLDER) -> list[str]:
@@ -119,7 +108,7 @@ HOW = {
 }
 
 
-def as_recipe(argument: str, group: Literal["task", "method"], given: Any) -> Recipe:
+def as_recipe(argument: str, group: Group, given: Any) -> Recipe:
     """Returns a recipe, also of its name.
 
     Raises:
@@ -129,12 +118,23 @@ def as_recipe(argument: str, group: Literal["task", "method"], given: Any) -> Re
         return given
     if not isinstance(given, str) or given not in available(group):
         raise _refusal(f"{argument}={given!r}: must be {HOW[group]} {', '.join(available(group))}")
-    return recipe_function(group, given)()
+    return Recipe(group, given, _words(group, given))
+
+
+def _words(group: Group, name: str) -> tuple[str, ...]:
+    return (f"{'+' if group == 'method' else ''}{group}={name}",)
 
 
 @cache
-def recipe_function(group: Literal["task", "method"], name: str) -> Callable[..., Recipe]:
+def recipe_function(
+    group: Group, name: str, around: Callable[..., Any] | None = None
+) -> Callable[..., Recipe]:
     """Returns the function ``prl.curricula.NAME`` or ``prl.tasks.NAME``.
+
+    Args:
+        group: ``"task"`` or ``"method"``.
+        name: of a file.
+        around: makes the model that a method's file may have; its settings are the method's, too.
 
     Raises:
         AttributeError: if there is no such file, with those that there are.
@@ -142,147 +142,154 @@ def recipe_function(group: Literal["task", "method"], name: str) -> Callable[...
     if name not in available(group):
         known = ", ".join(available(group))
         raise AttributeError(f"there is no {name!r}; there are: {known}")
-    settings: dict[str, Any] = {}
-    for more in _by_key(group, name).values():
-        settings = {**more, **settings}
-    del settings["_target_"]
-    parameters = [
-        inspect.Parameter(
-            key,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=inspect.Parameter.empty if value == MISSING else value,
-        )
-        for key, value in settings.items()
-    ]
+    from proposer_rl.settings import check_names  # which help does without
+
+    settings = _settings(group, name, around)
+    parameters = [p for key in reversed(settings) for p in settings[key].values()]
 
     def make(**given: Any) -> Recipe:
-        from proposer_rl.settings import check_names  # which help does without
-
-        check_names(make, given)
-        return Recipe(group, name, given)
+        check_names(signature.parameters, given)
+        keys = {
+            key: {n: v for n, v in given.items() if n in known} for key, known in settings.items()
+        }
+        return Recipe(group, name, _words(group, name), {k: v for k, v in keys.items() if v})
 
     about = next(comments(CONFIG_FOLDER / group / f"{name}.yaml"))
     make.__name__ = make.__qualname__ = name
-    make.__doc__ = f"{about}\n\nThe settings are those of conf/{group}/{name}.yaml."
-    make.__signature__ = inspect.Signature(parameters, return_annotation=Recipe)  # type: ignore[attr-defined]
+    make.__doc__ = f"{about}\n\nThe file is conf/{group}/{name}.yaml."
+    signature = Signature(parameters, return_annotation=Recipe)
+    make.__signature__ = signature  # type: ignore[attr-defined]
     return make
 
 
-def filter_content(filter: Mapping[str, Any] | str) -> dict[str, Any]:
-    """Returns what a filter sets below the keys ``filter`` and ``model``.
+def _settings(
+    group: Group, name: str, around: Callable[..., Any] | None
+) -> dict[str, dict[str, Parameter]]:
+    """Returns the settings that a file's recipe takes, by the key that they stand below."""
+    from proposer_rl.settings import schema
+
+    if group == "task":
+        file = plain_values(composed(_words(group, name)).task)
+        required = {"???": Parameter.empty}
+        takes = {
+            n: Parameter(n, Parameter.KEYWORD_ONLY, default=required.get(str(value), value))
+            for n, value in file.items()
+            if n != "_target_"
+        }
+        return {"task": takes}
+    config = composed([NO_TASK, *_words(group, name)])
+    named = {"_target_": config.curriculum._target_}
+    makers = {"curriculum": maker("curriculum", named)[0]}
+    if around is not None and config.model is not None:
+        makers["model"] = around
+    found = {}
+    for key, make in makers.items():
+        file = plain_values(config[key])
+        found[key] = {n: p.replace(default=file.get(n, p.default)) for n, p in schema(make).items()}
+    return found
+
+
+def composed(words: Sequence[str], *settings: Mapping[str, Any]) -> DictConfig:
+    """Returns what Hydra composes from words such as ``+method=plr``, and settings merged into it.
 
     Args:
-        filter: a name in ``conf/filter``, or settings; with any of a model's, such as ``labels``,
-            the rest is as in ``conf/filter/model.yaml``.
+        words: as on the command line.
+        settings: by top-level key; later ones win.
 
     Raises:
-        ArgumentError: if there is no such file.
+        ArgumentError: for what is in no file, or does not fit.
     """
-    keys = ("filter", "model")
-    if isinstance(filter, str):
-        if filter not in available("filter"):
-            raise _refusal(f"filter={filter!r}: must be one of {available('filter')}")
-        content = file_content(f"filter/{filter}")
-        return {key: content[key] for key in keys if key in content}
-    known = file_content("filter/model")
-    own = {name: value for name, value in filter.items() if name in known["model"]}
-    rest = {name: value for name, value in filter.items() if name not in own}
-    if not own:
-        return {"filter": rest}
-    return {"filter": known["filter"] | rest, "model": known["model"] | own}
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
 
-
-def _by_key(group: str, name: str) -> dict[str, dict[str, Any]]:
-    content = file_content(f"{group}/{name}")
-    return {key: content.get(key) or {} for key in KEYS[group]}
-
-
-def override(key: str, value: Any) -> str:
-    """Returns a key and its value as one of Hydra's overrides; a function by its dotted name.
-
-    Raises:
-        ArgumentError: naming the key, as :func:`override_value`.
-    """
-    if isfunction(value):
-        value = _dotted(key.lstrip("+"), value)
     try:
-        return f"{key}={override_value(value)}"
-    except ValueError as error:
-        raise _refusal(f"{key.lstrip('+')}={error}") from error
+        # A teacher's settings may have functions in them.
+        more = [OmegaConf.create(dict(s), flags={"allow_objects": True}) for s in settings]
+        config: Any = OmegaConf.merge(_composed(tuple(words)), *more)
+        return config
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
+        raise _refusal(explained(error)) from error
 
 
-def override_value(value: Any) -> str:
-    r"""Returns a value of Python, NumPy or OmegaConf in Hydra's grammar of overrides.
+@lru_cache(64)
+def _composed(words: tuple[str, ...]) -> DictConfig:
+    from hydra import compose, initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.singleton import Singleton
+    from omegaconf import OmegaConf
+
+    with COMPOSING:
+        before = Singleton.get_state()
+        GlobalHydra.instance().clear()
+        try:
+            with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
+                config = compose("train", [*words])
+        finally:
+            Singleton.set_state(before)
+    OmegaConf.set_struct(config, False)
+    return config
+
+
+def plain_values(config: Any, resolve: bool = False) -> dict[str, Any]:
+    """Returns a part of a configuration as Python's own, references to other parts as they are."""
+    from omegaconf import OmegaConf
+
+    values: Any = OmegaConf.to_container(config, resolve=resolve)
+    return dict(values)
+
+
+def maker(key: str, values: Mapping[str, Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """Returns what makes an object of a configuration, and the settings to call it with.
+
+    Args:
+        key: of the configuration, such as ``curriculum``.
+        values: at that key. ``_target_`` names a class or function; of a class with a method
+            ``create`` that one is returned. Values that have a ``_target_`` themselves are made by
+            Hydra.
 
     Raises:
-        ArgumentError: if it is neither a number, a text, a list nor a mapping of such.
-
-    Example:
-        >>> override_value({"a": [1, None, True], "b": "it's"})
-        "{a: [1, null, true], b: 'it\\'s'}"
+        ArgumentError: if nothing is named, or it cannot be imported.
     """
-    from proposer_rl.settings import plain, shown  # which help does without
+    from hydra.errors import HydraException
+    from hydra.utils import instantiate
 
-    value = plain(value)
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    if isinstance(value, int | float):
-        return repr(value)
-    if isinstance(value, str | Path):
-        # Hydra takes backslashes as they are, but for those before a quote: these are doubled.
-        text = re.sub(r"(\\+)('|\Z)", r"\1\1\2", str(value))
-        return "'" + text.replace("'", r"\'") + "'"
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_key(k)}: {override_value(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(override_value, value)) + "]"
-    raise _refusal(f"{shown(value)}: must be a number, a text, a list or a mapping of such")
-
-
-def _key(key: Any) -> str:
-    if not isinstance(key, str) or not KEY.fullmatch(key) or key.casefold() in CONSTANTS:
+    if not isinstance(values.get("_target_"), str):
         raise _refusal(
-            f"{key!r}: a name must begin with a letter, and have letters, digits, underscores, "
-            "hyphens and single spaces alone"
+            f"{key}._target_: missing: the class or function that makes the {key}; a file of "
+            "your own has it from another, such as by `defaults: [gymnasium, _self_]`"
         )
-    return key
+    try:
+        made = instantiate({**values, "_partial_": True}, _convert_="all")
+        inspect.signature(made.func)
+    except (HydraException, ImportError, AttributeError, TypeError, ValueError) as error:
+        cause: BaseException = error
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
+        said = " ".join(str(cause).split())
+        raise _refusal(f"{key}: {said}{where_to_look(cause)}") from error
+    return getattr(made.func, "create", made.func), made.keywords
 
 
-def file_content(name: str) -> dict[str, Any]:
-    """Returns the content of a file such as ``method/plr``, merged over those it builds on."""
-    content, group = yaml_file(name), name.partition("/")[0]
-    parts = []
-    for default in content.pop("defaults", ()):
-        if isinstance(default, str) and default != "_self_":
-            base = default.removesuffix("@_global_").removeprefix("/")
-            parts.append(file_content(base if "/" in base else f"{group}/{base}"))
-    return merged(*parts, content)
+def explained(error: Exception) -> str:
+    """Returns one line on an error in composing: an unknown file or key with those that exist."""
+    from hydra.errors import MissingConfigException, OverrideParseException
+    from omegaconf import DictConfig
+    from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
-
-def merged(*settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns mappings merged key by key, later ones first; None replaces a whole mapping."""
-    found: dict[str, Any] = {}
-    for some in settings:
-        for key, value in some.items():
-            own = isinstance(value, Mapping)
-            found[key] = merged(found.get(key) or {}, value) if own else value
-    return found
-
-
-def resolved(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the settings of a file, with references to ``train.yaml`` resolved."""
-    train, found = yaml_file("train"), dict(settings)
-    for name, value in settings.items():
-        reference = REFERENCE.fullmatch(value) if isinstance(value, str) else None
-        if reference is not None:
-            found[name] = reduce(lambda place, key: place[key], reference[1].split("."), train)
-    return found
-
-
-def yaml_file(name: str) -> dict[str, Any]:
-    """Returns the content of a configuration file, named from its folder on without ``.yaml``."""
-    content = yaml.safe_load((CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
-    return content or {}
+    if isinstance(error, MissingConfigException) and error.options:
+        return f"{error.missing_cfg_file}: unknown; choose one of: {', '.join(error.options)}"
+    said = " ".join(str(error).split())
+    if isinstance(error, OverrideParseException):
+        return f"{error.override}: {said}"
+    cause: Any = error.__cause__
+    if isinstance(cause, ConfigAttributeError | ConfigKeyError):
+        holder = cause.parent_node
+        if isinstance(holder, DictConfig):
+            known = sorted(str(key) for key in holder if holder._get_full_key(key) != "hydra")
+            return f"{cause.full_key}: unknown; there are: {', '.join(known) or 'none'}"
+    return ": ".join(" ".join(str(each).split()) for each in (error, cause) if each)
 
 
 def comments(file: Path) -> Iterator[str]:

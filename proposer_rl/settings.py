@@ -11,7 +11,8 @@ from __future__ import annotations
 import functools
 import inspect
 import json
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from operator import index
 from typing import (
@@ -58,6 +59,10 @@ class ArgumentError(ValueError):
     exit_code = 2
 
 
+class WholeKeyError(ArgumentError):
+    """Another setting is not allowed where this one is: the line has its whole key."""
+
+
 def checked(function: Callable[P, T]) -> Callable[P, T]:
     """Holds every call of a function to its signature; of a class, decorate ``__init__``.
 
@@ -78,10 +83,11 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
         proposer_rl.settings.ArgumentError: temperature=0: input should be greater than 0
     """
     signature = inspect.signature(function)
+    known = {name: p for name, p in signature.parameters.items() if name != "self"}
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        check_names(function, kwargs, missing=False)
+        check_names(known, kwargs, missing=False)
         bound = signature.bind(*args, **kwargs)
         bound.arguments.update(_checked_values(function, bound.arguments))
         return function(*bound.args, **bound.kwargs)
@@ -106,10 +112,7 @@ def signed(made: type[T]) -> type[T]:
 
 
 def arguments(
-    function: Callable[..., Any],
-    values: Mapping[str, Any],
-    given: Collection[str] = (),
-    others: Collection[str] = (),
+    function: Callable[..., Any], values: Mapping[str, Any], given: Collection[str] = ()
 ) -> dict[str, Any]:
     """Checks arguments against the signature of what will be called with them.
 
@@ -122,7 +125,6 @@ def arguments(
         function: a class or function.
         values: by name.
         given: names of arguments that it gets otherwise.
-        others: names of values that something else will be called with, which stay as they are.
 
     Returns:
         The same arguments, with the values as the signature's types have them.
@@ -142,30 +144,84 @@ def arguments(
         ...
         proposer_rl.settings.ArgumentError: rat: unknown; there are: rate, source
     """
-    check_names(function, values, given, others=others)
+    parameters = inspect.signature(function).parameters
+    check_names({name: p for name, p in parameters.items() if name not in ("self", *given)}, values)
     return _checked_values(function, values)
 
 
+@functools.cache
+def schema(make: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    """Returns what a configuration may set of a function: its keyword-only arguments, by name.
+
+    Where a class's method, such as ``Curriculum.create``, takes ``**settings``, these are the
+    keyword-only arguments of the class's constructor.
+    """
+    parameters = inspect.signature(make).parameters
+    found = {name: p for name, p in parameters.items() if p.kind >= p.KEYWORD_ONLY}
+    cls = getattr(make, "__self__", None)
+    for name, parameter in [*found.items()]:
+        if parameter.kind is parameter.VAR_KEYWORD and inspect.isclass(cls):
+            del found[name]
+            found |= schema(cls.__init__)
+    return found
+
+
+def configured(make: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Checks values against the :func:`schema` of a function, as :func:`arguments` does."""
+    check_names(schema(make), values)
+    cls = getattr(make, "__self__", None)
+    constructor = [cls.__init__] if inspect.isclass(cls) else []
+    for function in (make, *constructor):
+        values = _checked_values(function, values)
+    return dict(values)
+
+
+def with_defaults(make: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns values over the defaults of a function's :func:`schema`, those that JSON can hold."""
+    found = {}
+    for name, parameter in schema(make).items():
+        with suppress(TypeError):  # such as where there is none
+            found[name] = json.loads(json.dumps(parameter.default))
+    return {**found, **values}
+
+
 def check_names(
-    function: Callable[..., Any],
-    values: Mapping[str, Any],
-    given: Collection[str] = (),
-    missing: bool = True,
-    others: Collection[str] = (),
+    known: Mapping[str, inspect.Parameter], values: Mapping[str, Any], missing: bool = True
 ) -> None:
     """Refuses unknown names, and if asked missing ones; see :func:`arguments`."""
-    parameters = inspect.signature(function).parameters.values()
-    named = [p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
-    known = [*others, *(p.name for p in named if p.name not in ("self", *given))]
-    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters)
+    named = [p for p in known.values() if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+    names = [p.name for p in named]
+    takes_any = any(p.kind is p.VAR_KEYWORD for p in known.values())
     for name in values:
-        if name not in known and not takes_any:
-            available = f"there are: {', '.join(known)}" if known else "there are none"
+        if name not in names and not takes_any:
+            available = f"there are: {', '.join(names)}" if names else "there are none"
             raise ArgumentError(f"{name}: unknown; {available}")
     for parameter in named:
-        asked = parameter.default is parameter.empty and parameter.name in known
-        if missing and asked and parameter.name not in values:
+        if missing and parameter.default is parameter.empty and parameter.name not in values:
             raise ArgumentError(f"{parameter.name}: missing")
+
+
+@contextmanager
+def within(name: str, *others: type[Exception], lead: str | None = None) -> Iterator[None]:
+    """Puts a name and a dot before the lines of argument errors.
+
+    Args:
+        name: of the argument, or key of the configuration, that they are within.
+        others: errors that mean bad input, too.
+        lead: what comes before the text of these; None for the name and a colon.
+
+    Raises:
+        ArgumentError: with that line.
+    """
+    try:
+        yield
+    except WholeKeyError:
+        raise
+    except ArgumentError as error:
+        raise ArgumentError(f"{name}.{error}") from error
+    except others as error:
+        said = " ".join(str(error).split())
+        raise ArgumentError(f"{f'{name}: ' if lead is None else lead}{said}") from error
 
 
 def _checked_values(function: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:

@@ -51,7 +51,7 @@ def _rows(options: argparse.Namespace) -> Rows:
     proposer, seed = options.proposer, options.seed
     config = saved_config(proposer)
     task = make_task(config)
-    frozen = frozen_proposer(Components(task, config.proposer, [seed]), str(proposer))
+    frozen = frozen_proposer(Components(task, config.proposer, seed), checkpoint=str(proposer))
     frozen.view.draw_levels(Streams(seed, "look"))
     stages = _stages(task, frozen, stored_run(options.solvers))
     rows = []

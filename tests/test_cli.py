@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import proposer_rl
-from proposer_rl.cli.run import quoted
+from proposer_rl.cli.groups import quoted
 from proposer_rl.experiment import Experiment
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.checkpoint import load_latest
@@ -219,7 +219,7 @@ def test_how_to_go_on_is_a_whole_command(train, monkeypatch, capsys) -> None:
 @example("it's \\' \\").via("its quotes and escapes")
 def test_a_folder_is_given_to_hydra_as_it_is(folder: str) -> None:
     parser = OverridesParser.create()
-    override = parser.parse_override(f"hydra.run.dir={quoted(folder)}")
+    override = parser.parse_override(quoted("hydra.run.dir", folder))
     assert str(override.value()) == folder
 
 

@@ -18,7 +18,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import proposer_rl as prl
 from proposer_rl.cli.eval import main as evaluate
-from proposer_rl.recipes import CONFIG_FOLDER
+from proposer_rl.cli.groups import arranged
+from proposer_rl.recipes import CONFIG_FOLDER, maker
+from proposer_rl.settings import check_names, schema
 from tests.commands import SMOKE, call, trained_run
 from tests.test_bin import MODULES
 from tests.test_readme import DOCS, README, ROOT, blocks, commands, run, smallest, write_files
@@ -80,7 +82,11 @@ def test_the_settings_exist(tmp_path: Path) -> None:
             overrides.append(f"hydra.searchpath=[file://{tmp_path / 'my_conf'}]")
         GlobalHydra.instance().clear()
         with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
-            compose("train", overrides, return_hydra_config=True)
+            config = compose("train", arranged(overrides), return_hydra_config=True)
+        if config.curriculum is not None:
+            make, _ = maker("curriculum", {"_target_": config.curriculum["_target_"]})
+            own = {name: None for name in config.curriculum if name != "_target_"}
+            check_names(schema(make), own, missing=False)
 
 
 class Parsed(Exception):

@@ -15,9 +15,14 @@ import pytest
 PACKAGE = "proposer_rl"
 ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 
-# Only the command line composes configurations; everything else takes plain arguments. The
-# one validator is pydantic's; so are the checks of a run's files and of what a browser asks.
-CONFIGURATION = {"hydra": {"cli"}, "omegaconf": {"cli"}, "pydantic": {"settings", "play", "runs"}}
+# Only the command line and recipes compose configurations; everything else takes plain arguments.
+# The one validator is pydantic's; so are the checks of a run's files and of what a browser asks.
+COMPOSING = {"cli", "recipes"}
+CONFIGURATION = {
+    "hydra": COMPOSING,
+    "omegaconf": COMPOSING,
+    "pydantic": {"settings", "play", "runs"},
+}
 # What reads runs must start at once.
 HEAVY = {"torch", "torchrl", "tensordict"}
 READERS = ("report", "cli.watch", "cli.report")
@@ -139,7 +144,7 @@ def test_there_are_few_rooms() -> None:
     assert len(found) <= MOST_ROOMS, sorted(found)
 
 
-def test_only_the_command_line_sees_configurations() -> None:
+def test_few_rooms_see_configurations() -> None:
     graph = imports(ROOT)
     for tool, allowed in CONFIGURATION.items():
         users = {name.partition(".")[0] for name, used in graph.items() if tool in used}

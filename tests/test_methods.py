@@ -8,89 +8,106 @@ from typing import Any
 import pytest
 
 import proposer_rl as prl
-from proposer_rl.curricula import ReplayRule, SamplingCurriculum, Scorer, Student
-from proposer_rl.meta.assembly import ProposerSettings
-from proposer_rl.methods import Components, UnfitTaskError, filtered, make, mixture, target
+from proposer_rl.curricula import Curriculum, SamplingCurriculum, Student
+from proposer_rl.meta.assembly import Components, ProposerSettings
+from proposer_rl.methods import UnfitTaskError, build, completed
 from proposer_rl.settings import ArgumentError, Count
 from proposer_rl.streams import Streams
 
-TASK = SimpleNamespace(space="the space", target="the target", edit=abs)
-RUN = Components(TASK, ProposerSettings(), [3])  # type: ignore[arg-type]
+
+def run_of(task: Any) -> Components:
+    return Components(task, ProposerSettings(), 3)
 
 
-class Own:
-    """What it is made of."""
-
-    def __init__(self, space: Any, *, every: Count = 2, edit: Any = None, seeds: Any = ()) -> None:
-        self.got = space, every, edit, seeds
+RUN = run_of(SimpleNamespace(space="the space", target="the target"))
 
 
-class Scoring:
-    """What it is made of."""
+class OfSpace(Curriculum):
+    """Takes the space, as curricula do that do not say otherwise."""
 
-    def __init__(self, target: Any, scorer: Scorer, rule: ReplayRule | None = None) -> None:
-        self.got = target, scorer.rollouts, rule
-
-
-def of_a_run(parts, probability: float, target: float = 0.5) -> Any:
-    return parts, probability, target
+    def __init__(self, space: Any, *, every: Count = 2, score: str) -> None:
+        self.got: Any = space, every, score
 
 
-def of_components(run: Components, **settings: Any) -> Any:
-    return run, settings
+class OfTarget(OfSpace):
+    """Says what it takes, and has a setting that the constructor has not."""
+
+    @classmethod
+    def create(cls, run: Components, *, times: Count = 3, **settings: Any) -> OfTarget:
+        return cls((run.task.target, run.optional("edit"), times), **settings)
 
 
-def of_settings(probability: float, features: Any = "none") -> Any:
-    return probability, features
+def of_run(run, *, probability: float, more: tuple[int, ...] = (1, 2)) -> Curriculum:
+    return OfSpace((run, probability, more), score="")
 
 
-def test_it_gets_by_name_what_the_run_has_and_what_it_lacks_by_default() -> None:
-    assert make(Own, {}, RUN).got == ("the space", 2, abs, [3])
-    assert make(Own, {"every": 5}, RUN, edit=max).got == ("the space", 5, max, [3])
-    bare = Components(SimpleNamespace(space=1), ProposerSettings(), [3])  # type: ignore[arg-type]
-    assert make(Own, {}, bare).got == (1, 2, None, [3])
-    assert make(of_settings, {"probability": 1}, RUN) == (1.0, "none")
+def of_any(run: Components, **settings: Any) -> Curriculum:
+    return OfSpace(settings, score="")
 
 
-def test_parts_are_made_of_the_settings_that_they_take() -> None:
-    settings = {"score": "regret", "source": "exact", "rollouts": 3, "temperature": 2}
-    assert make(Scoring, settings, RUN).got == ("the target", 3, ReplayRule(temperature=2))
+def of_nothing(run: Components) -> int:
+    return len("nothing")
 
 
-def test_a_first_parameter_of_no_such_name_is_the_run() -> None:
-    assert make(of_a_run, {"probability": 1}, RUN) == (RUN, 1.0, 0.5)
-    assert make(of_components, {"x": 1}, RUN) == (RUN, {"x": 1})
+def asks_of_another(run: Components) -> int:
+    return (0).x  # type: ignore[attr-defined]
+
+
+def made(target: Any, **settings: Any) -> Any:
+    return {"curriculum": {"_target_": f"{__name__}.{target.__name__}", **settings}}
+
+
+def test_it_is_called_with_the_run_and_its_settings() -> None:
+    assert build(made(OfSpace, score="a"), RUN).got == ("the space", 2, "a")
+    assert build(made(OfTarget, score="a", every=5), RUN).got == (("the target", None, 3), 5, "a")
+    assert build(made(of_run, probability=1), RUN).got[0] == (RUN, 1.0, (1, 2))
+    assert build(made(of_any, x=1), RUN).got[0] == {"x": 1}
+
+
+def test_what_is_stored_has_every_default() -> None:
+    whole = completed(made(OfTarget, score="a"))["curriculum"]
+    assert whole == made(OfTarget, times=3, every=2, score="a")["curriculum"]
+    assert completed(made(of_run, probability=1))["curriculum"]["more"] == [1, 2]  # as JSON has it
+    around = completed({**made(OfSpace), "filter": {"times": 8}, "model": None})
+    assert around["filter"]["times"] == 8 and around["filter"]["rollouts"] == 8
+    assert around["model"] is None and "score" not in around["curriculum"]
 
 
 @pytest.mark.parametrize(
-    ("made", "settings", "message"),
+    ("config", "message"),
     [
-        (Own, {"every": 0}, "^every=0: input should be"),
-        (Own, {"space": 1}, "^space: unknown; there are: every$"),
-        (Scoring, {"scoer": 1}, "^scoer: unknown; there are: score, source, rollouts, priorit"),
-        (Scoring, {"score": "regret"}, "^source: missing$"),
-        (Scoring, {"score": "regret", "source": "luck"}, "^source='luck': input should be"),
-        (of_settings, {}, "^probability: missing$"),
+        (made(OfSpace, score="a", every=0), "^curriculum.every=0: input should be"),
+        (made(OfSpace, space=1), "^curriculum.space: unknown; there are: every, score$"),
+        (made(OfTarget, tims=1), "^curriculum.tims: unknown; there are: times, every, score$"),
+        (made(OfTarget, times=0, score="a"), "^curriculum.times=0: input should be"),
+        (made(OfSpace), "^curriculum.score: missing$"),
+        (made(of_nothing, x=1), "^curriculum.x: unknown; there are none$"),
+        (made(of_nothing), "^curriculum: must make a Curriculum, but makes int$"),
+        ({"curriculum": {}}, "^curriculum._target_: missing"),
+        ({**made(OfSpace, score="a"), "filter": {"times": 1}}, "^filter.times=1: input should"),
+        ({**made(OfSpace, score="a"), "model": {"time": 1}}, "^model.time: unknown; there are: la"),
     ],
 )
-def test_settings_that_are_not_allowed_are_refused(made: Any, settings: Any, message: str) -> None:
+def test_settings_that_are_not_allowed_are_refused(config: Any, message: str) -> None:
     with pytest.raises(ArgumentError, match=message):
-        make(made, settings, RUN)
+        build(config, RUN)
 
 
 def test_what_a_task_lacks_is_named_and_other_errors_are_as_they_are() -> None:
-    bare = Components(SimpleNamespace(), ProposerSettings(), [0])  # type: ignore[arg-type]
     with pytest.raises(UnfitTaskError, match="needs target of a task, which SimpleNamespace does"):
-        make(target, {}, bare)
+        build(made(OfTarget, score="a"), run_of(SimpleNamespace()))
     with pytest.raises(AttributeError, match="'int' object has no attribute 'x'"):
-        make(lambda space: (0).x, {}, RUN)  # type: ignore[attr-defined]
-    with pytest.raises(ArgumentError, match=r"^times=1: "):
-        filtered(None, {"times": 1}, RUN)  # type: ignore[arg-type]
+        build(made(asks_of_another), RUN)
+
+
+def mixture(parts: Any, **rest: Any) -> Curriculum:
+    """The mixture of a run on ranges."""
+    asked = {"_target_": "proposer_rl.methods.mixture", "parts": parts}
+    return build({"curriculum": asked, **rest}, run_of(RANGES))
 
 
 RANGES = prl.Parameters({"x": (0.0, 1.0)}, target={"x": 1.0})
 OFF = ("domain_randomization", "target", "currot")  # the mixture's own
-ON_RANGES = Components(RANGES, ProposerSettings(), [3])  # type: ignore[arg-type]
 
 
 def test_a_mixture_is_what_its_methods_propose_by_themselves() -> None:
@@ -100,7 +117,7 @@ def test_a_mixture_is_what_its_methods_propose_by_themselves() -> None:
         "alp_gmm": {"share": 0},
         "learning_progress": {"source": "episodes", "exploration": 1.0},
     }
-    made = mixture(ON_RANGES, parts)
+    made = mixture(parts)
     assert made.needs == () and made.required_results == ("success",)
     drawn = made.propose(Student(), 40, Streams(0)).levels["x"]
     assert (drawn[:10] == 1).all()
@@ -124,14 +141,20 @@ def test_the_mixture_of_thirds_asks_one_model_of_success_and_nobody_else() -> No
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"plrr": {}}, r"^parts.plrr: unknown; there are: accel, "),
-        ({"plr": {}}, r"^parts.plr.capacity: missing; alone the method has that of pool.capacity$"),
-        ({"target": {"share": -1}}, "^parts.target.share=-1: input should be"),
-        ({"target": {"share": 0}}, r"^parts=.*'target'.*: must have one whose share is above 0$"),
-        ({"target": {"name": 0}}, "^parts.target.name: unknown; there are none$"),
-        ({"alp_gmm": {"refit": 0}}, "^parts.alp_gmm.refit=0: input should be"),
-        ({"target": {"filter": "no"}}, "^parts.target.filter='no': must be one of"),
-        ({"target": 1}, "^parts.target=1: input should be an object"),
+        ({"plrr": {}}, r"^curriculum.parts.plrr: unknown; there are: accel, "),
+        (
+            {"plr": {}},
+            r"^curriculum.parts.plr.capacity: missing; alone the method has that of pool.capacity$",
+        ),
+        ({"target": {"share": -1}}, "^curriculum.parts.target.share=-1: input should be"),
+        (
+            {"target": {"share": 0}},
+            r"^curriculum.parts=.*'target'.*: must have one whose share is above 0$",
+        ),
+        ({"target": {"name": 0}}, "^curriculum.parts.target.name: unknown; there are none$"),
+        ({"alp_gmm": {"refit": 0}}, "^curriculum.parts.alp_gmm.refit=0: input should be"),
+        ({"target": {"filter": "no"}}, "^curriculum.parts.target.filter='no': must be one of"),
+        ({"target": 1}, "^curriculum.parts.target=1: input should be an object"),
     ],
 )
 def test_a_part_that_is_not_allowed_is_named(parts: Any, message: str) -> None:

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from proposer_rl.recipes import CONFIG_FOLDER
+from proposer_rl.cli.groups import arranged
+from proposer_rl.methods import completed
+from proposer_rl.recipes import composed, plain_values
 from proposer_rl.report.comparisons import UNDECIDED
 from proposer_rl.report.outcomes import comparison_table, group_table
 from proposer_rl.report.studies import read_studies
@@ -217,9 +217,7 @@ def test_a_run_of_today_is_of_the_same_variant_as_the_published_ones(study: str)
         group.runs[0] for group in found.groups if group.runs[0].config["method"] not in GONE
     ):
         words = [word for word in run.facts["overrides"] if not word.startswith(("seed", "hydra."))]
-        GlobalHydra.instance().clear()
-        with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
-            values = OmegaConf.to_container(compose("train", words), resolve=True)
+        values = completed(plain_values(composed(arranged(words)), resolve=True))
         aside = {"seed", "seeds", "schedule", "precision", "compute", "logger"}
         now, then = ({k: each[k] for k in each.keys() - aside} for each in (values, run.config))
         assert now == then, run.folder.name

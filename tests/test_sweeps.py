@@ -15,12 +15,14 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import OmegaConf
 
+from proposer_rl import recipes
 from proposer_rl.cli.config import RunConfig
 from proposer_rl.cli.errors import ConfigError
 from proposer_rl.cli.groups import settings_name
 from proposer_rl.cli.train import FailedRunError, main
 from proposer_rl.experiment import Experiment
-from proposer_rl.recipes import CONFIG_FOLDER, available, file_content
+from proposer_rl.methods import completed
+from proposer_rl.recipes import CONFIG_FOLDER, available, plain_values
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.runs.process import Interrupted, locked
 from proposer_rl.tasks.gymnasium.player import LevelPlayer
@@ -377,5 +379,5 @@ def test_the_arena_has_every_task_in_one_half_and_known_rows() -> None:
     rows = planned["+method"].split(",")
     assert {"target", "domain_randomization"} <= set(rows)
     for row in rows:  # of what asks for success nothing asks more of the task than episodes
-        curriculum = file_content(f"method/{row}")["curriculum"]
+        curriculum = completed(plain_values(recipes.composed([f"+method={row}"])))["curriculum"]
         assert curriculum.get("source", "episodes") == "episodes"

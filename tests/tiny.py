@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 from tensordict import TensorDictBase
 
+from proposer_rl import recipes
 from proposer_rl.cli.config import RunConfig, read_config
+from proposer_rl.cli.groups import arranged
 from proposer_rl.learning import PPO, PPOSettings, SolverSettings
 from proposer_rl.models import ActorCritic, cell_logits
-from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings
@@ -130,6 +129,4 @@ def evaluate(agent: ActorCritic, levels: Level) -> TensorDictBase:
 
 def composed(*overrides: str) -> RunConfig:
     """The settings that the command gets."""
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
-        return read_config(compose("train", list(overrides)))
+    return read_config(recipes.composed(arranged(overrides)))

@@ -8,17 +8,20 @@ from typing import Any, NamedTuple
 
 import torch
 
-from proposer_rl.cli.config import CANNOT_BE_CALLED, RunConfig, key, located, task_maker
+from proposer_rl import methods
+from proposer_rl.cli.config import RunConfig, task_maker
 from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, require
 from proposer_rl.experiment import Experiment, Log, check_headline
 from proposer_rl.extras import require_package
 from proposer_rl.learning import PPO, SolverSettings
+from proposer_rl.meta.assembly import Components, Workers
 from proposer_rl.meta.workers import WorkerSettings
-from proposer_rl.methods import Components, ProposerError, Workers, filtered, make, modelled
+from proposer_rl.methods import CANNOT_BE_CALLED
 from proposer_rl.models import available_cores, check_torch_defaults, use_device
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.process import Status, StopSignals
+from proposer_rl.settings import within
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
 
@@ -36,12 +39,12 @@ def parts(config: RunConfig, signals: StopSignals, status: Status | None = None)
     if config.logger.type != "csv":
         require_package(f"logger={config.logger.type}", config.logger.type, config.logger.type)
     task = make_task(config)
-    with key("solver.ppo"):
+    with within("solver.ppo", ValueError):
         learner = task.learner([Streams(seed, "solver") for seed in config.seeds])
-    with key("schedule"):
+    with within("schedule"):
         check_headline(task, config.schedule)
     curricula = [_curriculum(config, task, seed, signals, status) for seed in config.seeds]
-    with key("curriculum", "curriculum: ", (TypeError, ValueError)):
+    with within("curriculum", *CANNOT_BE_CALLED):
         require(TaskStudent(task, learner), curricula[0].needs, f"method={config.method}")
     return Made(task, learner, curricula)
 
@@ -77,8 +80,9 @@ def make_task(config: RunConfig) -> Task:
         device, config.precision, compute.cores, compute.graphs, compute.compile
     )
     check_torch_defaults()
-    with key("task", "task."):
-        task: Task = _made(task_maker(config.task), config.solver, context, str(device))
+    maker = task_maker(config.task)
+    with within("task", ValueError, lead="task."):
+        task: Task = _made(maker, config.solver, context, str(device))
     check_torch_defaults()  # an environment's module may have set them as it was imported
     if task.device.type != device.type:
         warnings.warn(
@@ -104,26 +108,15 @@ def _curriculum(
         signals.check()
 
     workers = _workers(config, task)
-    run = Components(task, config.proposer, [seed], on_update, workers)
-    with (
-        key("curriculum", "curriculum: ", CANNOT_BE_CALLED),
-        key("proposer", kinds=(ProposerError,)),
-    ):
-        curriculum = make(*located("curriculum", config.curriculum), run)
-        if not isinstance(curriculum, Curriculum):
-            raise TypeError(f"must make a Curriculum, but makes {type(curriculum).__name__}")
+    run = Components(task, config.proposer, seed, on_update, workers)
+    asked = {"curriculum": config.curriculum, "filter": config.filter, "model": config.model}
+    curriculum = methods.build(asked, run)
     learned = isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas
     if workers is not None and not learned:
         raise ConfigError(
             f"compute.collector={config.compute.collector}: this method trains no replicas "
             "that workers could have; leave compute.collector=single"
         )
-    if config.filter is not None:
-        with key("filter"):
-            curriculum = filtered(curriculum, config.filter, run)
-    if config.model is not None:
-        with key("model"):
-            curriculum = modelled(curriculum, config.model, run)
     return curriculum
 
 

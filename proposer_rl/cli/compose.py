@@ -1,4 +1,4 @@
-"""A run from overrides, in a process that is not Hydra's: what ``prl.train`` calls."""
+"""A run in a process that is not Hydra's: what ``prl.train`` calls."""
 
 from __future__ import annotations
 
@@ -7,75 +7,45 @@ from contextlib import suppress
 from datetime import datetime
 from itertools import chain, count
 from pathlib import Path
-from threading import RLock
 from typing import Any
 
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.core.singleton import Singleton
-from hydra.errors import HydraException
-from omegaconf import open_dict
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
+from omegaconf import OmegaConf
 
 from proposer_rl.cli.config import RunConfig, read_config
-from proposer_rl.cli.errors import ConfigError
-from proposer_rl.cli.groups import Invocation, arranged, check_groups, explained, invocation
+from proposer_rl.cli.groups import Invocation, check_groups, python_path
 from proposer_rl.cli.run import carry_out
 from proposer_rl.cli.shown import show_run
-from proposer_rl.recipes import CONFIG_FOLDER
+from proposer_rl.recipes import composed, plain_values, storable
 from proposer_rl.runs.folder import storage
 from proposer_rl.runs.process import StopSignals
 
-COMPOSING = RLock()  # Hydra composes with globals of the process
 
-
-def compose_and_run(overrides: Sequence[str], own: Mapping[str, Any], folder: Path | None) -> Path:
-    """Trains as ``bin/train`` with these overrides does; threads may call it side by side.
+def compose_and_run(
+    words: Sequence[str], settings: Sequence[Mapping[str, Any]], folder: Path | None
+) -> Path:
+    """Trains as ``bin/train`` with these settings does; threads may call it side by side.
 
     Args:
-        overrides: as on the command line.
-        own: what takes the place of top-level keys; of a task or curriculum that no file has.
+        words: names of files, as on the command line.
+        settings: by top-level key, merged into what the files have; later ones win.
         folder: the run's; None for a new one below ``outputs/``.
 
     Returns:
         The run's folder, absolute.
 
     Raises:
-        ConfigError: naming the first wrong key, its value and what is allowed.
+        ArgumentError: naming the first wrong key, its value and what is allowed.
         Interrupted: if a signal asked the run to stop; all is saved then.
     """
-    with COMPOSING:
-        config, asked = _composed(overrides, own, folder)
+    check_groups(words)
+    own = [{key: storable(key, value) for key, value in some.items()} for some in settings]
+    config = read_config(composed(words, *own))
+    asked = plain_values(OmegaConf.merge({}, *own))
+    path = (folder or _new_folder(config)).expanduser().absolute()
+    invocation = Invocation(path, [*words], python_path=python_path(), settings=asked)
     with StopSignals() as signals:
-        carry_out(config, asked, signals, show_run)
-    return asked.folder
-
-
-def _composed(
-    overrides: Sequence[str], own: Mapping[str, Any], folder: Path | None
-) -> tuple[RunConfig, Invocation]:
-    """Returns a run's settings; Hydra's globals are restored afterwards."""
-    before = Singleton.get_state()
-    GlobalHydra.instance().clear()
-    try:
-        overrides = arranged(overrides)
-        with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
-            config = compose("train", overrides, return_hydra_config=True)
-        HydraConfig.instance().set_config(config)
-        hydra = config.hydra
-        with open_dict(config):
-            del config["hydra"]
-            for key, value in own.items():
-                config[key] = value
-        check_groups(overrides)
-        read = read_config(config)
-        return read, invocation(hydra, overrides, folder or _new_folder(read))
-    except (HydraException, OmegaConfBaseException, YAMLError) as error:
-        raise ConfigError(explained(error)) from error
-    finally:
-        Singleton.set_state(before)
+        carry_out(config, invocation, signals, show_run)
+    return path
 
 
 def _new_folder(config: RunConfig) -> Path:

@@ -2,56 +2,29 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Le, Len
-from hydra.errors import HydraException
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from proposer_rl.cli.errors import ConfigError, one_line, settings_file
+from proposer_rl.cli.errors import ConfigError, settings_file
 from proposer_rl.experiment import ScheduleSettings
-from proposer_rl.extras import where_to_look
 from proposer_rl.learning import SolverSettings
 from proposer_rl.meta.assembly import ProposerSettings
+from proposer_rl.methods import CANNOT_BE_CALLED, completed
+from proposer_rl.recipes import maker
 from proposer_rl.runs.folder import read_bounded
-from proposer_rl.settings import ArgumentError, arguments, settings
+from proposer_rl.settings import arguments, settings, within
 
-# No number in use comes near; beyond it are typing errors, and what machine integers cannot hold.
-LARGEST = 10**9
 LARGEST_FILE = 10**6
 # What a task's maker is given beside the task's own settings.
 GIVEN_TO_TASKS = ("solver", "context")
-# Bad input, and what is said of annotations that name nothing.
-CANNOT_BE_CALLED = (ValueError, TypeError, NameError)
-
-
-@contextmanager
-def key(
-    name: str, other: str = "", kinds: tuple[type[Exception], ...] = (ValueError,)
-) -> Iterator[None]:
-    """Prefixes errors on arguments with the key of the configuration that they stand below.
-
-    Args:
-        name: the key.
-        other: what comes before any other error of these kinds.
-        kinds: that mean bad input.
-    """
-    try:
-        yield
-    except ConfigError:
-        raise
-    except kinds as error:
-        lead = f"{name}." if isinstance(error, ArgumentError) else other
-        raise ConfigError(f"{lead}{one_line(error)}") from error
 
 
 @settings
@@ -156,60 +129,37 @@ class RunConfig:
 
 
 def read_config(config: DictConfig) -> RunConfig:
-    """Checks a composed configuration and returns it as settings."""
-    if isinstance(config.task, DictConfig) and "_target_" not in config.task:
-        located("task", {})  # before interpolations find less than what a task brings
-    values = _resolved(config)
-    for name, value in _leaves(values):
-        if isinstance(value, int | float) and not abs(value) <= LARGEST:
-            raise ConfigError(f"{name}={value!r}: must be finite and at most {LARGEST:,} in size")
-    if isinstance(values["task"], dict):  # before what is made of its values elsewhere
+    """Checks a composed configuration and returns it as settings, with all defaults."""
+    if isinstance(config.get("task"), DictConfig) and "_target_" not in config.task:
+        maker("task", {})  # before interpolations find less than what a task brings
+    values = completed(_resolved(config))
+    if isinstance(values.get("task"), dict):  # before what is made of its values elsewhere
         task_maker(values["task"])
-    checked = _settings(values)
-    read = (value for _, value in _leaves(checked.curriculum))
-    if checked.checkpoint is not None and checked.checkpoint not in read:
+    read = _settings(values)
+    if read.checkpoint is not None and read.checkpoint not in read.curriculum.values():
         raise ConfigError(
-            f"checkpoint={checked.checkpoint}: method={checked.method} takes none; "
+            f"checkpoint={read.checkpoint}: method={read.method} takes none; "
             "those with a Proposer do, and a run goes on with hydra.run.dir=FOLDER"
         )
-    if len(set(checked.seeds)) < len(checked.seeds):
-        raise ConfigError(f"seeds={checked.seeds}: must be distinct")
-    until = checked.curriculum.get("until")
+    if len(set(read.seeds)) < len(read.seeds):
+        raise ConfigError(f"seeds={read.seeds}: must be distinct")
+    until = read.curriculum.get("until")
     ends = [end for end in until if isinstance(end, int)] if isinstance(until, list) else []
-    if max(ends, default=0) >= checked.schedule.updates:
+    if max(ends, default=0) >= read.schedule.updates:
         warnings.warn(
             f"curriculum.until={until}: the last stage never begins, since the run ends after "
-            f"{checked.schedule.updates} updates",
+            f"{read.schedule.updates} updates",
             stacklevel=2,
         )
-    return checked
+    return read
 
 
 def task_maker(values: Mapping[str, Any]) -> partial[Any]:
     """Returns a function that makes the task of these settings from ``solver`` and ``context``."""
-    target = f"task._target_={values.get('_target_')}"
-    make, own = located("task", values)
-    with key("task", f"{target}: ", CANNOT_BE_CALLED):
+    make, own = maker("task", values)
+    lead = f"task._target_={values['_target_']}: "
+    with within("task", *CANNOT_BE_CALLED, lead=lead):
         return partial(make, **arguments(make, own, GIVEN_TO_TASKS))
-
-
-def located(name: str, values: Mapping[str, Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Returns what ``_target_`` names, and the other settings, some of which are made by Hydra."""
-    target = values.get("_target_")
-    if not isinstance(target, str):
-        raise ConfigError(
-            f"{name}._target_: missing: the class or function that makes the {name}; a file of "
-            "your own has it from another, such as by `defaults: [gymnasium, _self_]`"
-        )
-    try:
-        made = instantiate({**values, "_partial_": True}, _convert_="all")
-        inspect.signature(made.func)
-    except (HydraException, ImportError, AttributeError, TypeError, ValueError) as error:
-        cause: BaseException = error
-        while cause.__cause__ is not None:
-            cause = cause.__cause__
-        raise ConfigError(f"{name}: {one_line(cause)}{where_to_look(cause)}") from error
-    return made.func, made.keywords
 
 
 def saved_config(folder: Path) -> RunConfig:
@@ -249,12 +199,3 @@ def _resolved(config: DictConfig) -> Any:
 
 def _settings(values: Mapping[str, Any]) -> RunConfig:
     return RunConfig(**arguments(RunConfig, values))
-
-
-def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields every value that is no mapping or list, with its dotted key."""
-    if isinstance(value, dict | list):
-        for part, inner in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _leaves(inner, f"{name}.{part}" if name else str(part))
-    else:
-        yield name, value

@@ -6,18 +6,18 @@ import hashlib
 import os
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import MissingConfigException, OverrideParseException
+from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
-from proposer_rl.cli.errors import ConfigError, one_line
+from proposer_rl.cli.errors import ConfigError
 from proposer_rl.cli.help import GROUPS
-from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, available, file_content, override, yaml_file
+from proposer_rl.recipes import CONFIG_FOLDER, NO_TASK, PACKAGE, available, composed
 
 # Files that change a method or a scale, and must come after it, since later files win.
 CHANGED = ("method", "scale")
@@ -25,6 +25,8 @@ CHANGING = [group.strip("+=") for group in GROUPS if group.startswith("+")]
 CHANGING = [group for group in CHANGING if group not in (*CHANGED, "sweep")]
 # The files that stand for null, which Hydra does not take for a group.
 NOTHING = {"filter": "none", "ablation": "none", "logger": "csv"}
+# Keys below which are settings of curricula, most of which are in no file.
+BUILT = ("curriculum.", "filter.", "model.")
 # What a sweep's folders are not named after: where a run is computed and shown, and what has a
 # place of its own in the name.
 UNNAMED = {"compute", "logger", "method", "seed", "seeds", "sweep"}
@@ -39,25 +41,29 @@ class Invocation(NamedTuple):
         overrides: as on the command line, with the run's interpolations unresolved.
         config_dir: given with ``--config-dir``; relative if it lies in the working folder.
         python_path: the caller's, without the checkout, which ``bin/`` adds.
+        settings: that :func:`proposer_rl.train` merges into what is composed; None of a command.
     """
 
     folder: Path
     overrides: list[str]
     config_dir: str | None = None
     python_path: str | None = None
+    settings: dict[str, Any] | None = None
 
 
-def invocation(hydra: Any, overrides: Sequence[str], folder: Path) -> Invocation:
-    """Returns how a run is asked for, from Hydra's configuration of it."""
+def invocation(hydra: Any, folder: Path) -> Invocation:
+    """Returns how a command asks for a run, from Hydra's configuration of it."""
     given = [s.path for s in hydra.runtime.config_sources if s.provider == "command-line"]
+    overrides: Any = OmegaConf.to_container(hydra.overrides.task)
+    here = next(map(_from_here, given), None)
+    return Invocation(folder.expanduser().absolute(), list(overrides), here, python_path())
+
+
+def python_path() -> str | None:
+    """Returns PYTHONPATH without the checkout; its folders are relative in the working one."""
     own = str(PACKAGE.parent)
     paths = [part for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part]
-    return Invocation(
-        folder.expanduser().absolute(),
-        list(overrides),
-        config_dir=next(map(_from_here, given), None),
-        python_path=os.pathsep.join(_from_here(part) for part in paths if part != own) or None,
-    )
+    return os.pathsep.join(_from_here(part) for part in paths if part != own) or None
 
 
 def _from_here(path: str) -> str:
@@ -67,18 +73,13 @@ def _from_here(path: str) -> str:
     return str(inside.relative_to(here)) if inside.is_relative_to(here) else path
 
 
-def given_overrides(hydra: Any) -> list[str]:
-    """Returns the overrides of a run, with its interpolations unresolved."""
-    given: Any = OmegaConf.to_container(hydra.overrides.task)
-    return list(given)
-
-
 def arranged(overrides: Sequence[str]) -> list[str]:
     """Returns overrides in the order and spelling in which Hydra takes them.
 
     Groups that change a method or a scale come after it. null for a group stands for its file that
-    changes nothing: ``logger=null`` is ``logger=csv``. A folder in the home folder may begin with
-    ``~``.
+    changes nothing: ``logger=null`` is ``logger=csv``. Settings that have defaults in Python may be
+    in no file: ``filter.times=8`` is ``++filter.times=8``. A folder in the home folder may begin
+    with ``~``.
 
     Raises:
         ConfigError: if a group is set to what cannot be a file's name, such as ``task=null``.
@@ -88,24 +89,40 @@ def arranged(overrides: Sequence[str]) -> list[str]:
     found = [_word(parsed) for parsed in OverridesParser.create().parse_overrides(words)]
     if "filter=null" in overrides and not _filters(found):
         found.remove(f"+filter={NOTHING['filter']}")  # which labels the run as changed
-    groups = [word.partition("=")[0].lstrip("+") for word in found]
+    return _ordered(found)
+
+
+def _ordered(words: Sequence[str]) -> list[str]:
+    groups = [word.partition("=")[0].lstrip("+") for word in words]
     end = max((place for place, group in enumerate(groups) if group in CHANGED), default=-1) + 1
     early = {place for place in range(end) if groups[place] in CHANGING}
-    first = [word for place, word in enumerate(found[:end]) if place not in early]
-    return [*first, *(found[place] for place in sorted(early)), *found[end:]]
+    first = [word for place, word in enumerate(words[:end]) if place not in early]
+    return [*first, *(words[place] for place in sorted(early)), *words[end:]]
+
+
+def quoted(key: str, text: str) -> str:
+    """Returns an override that sets a text, in quotes where Hydra's grammar needs them."""
+    with suppress(HydraException):
+        if OverridesParser.create().parse_override(f"{key}={text}").value() == text:
+            return f"{key}={text}"
+    # Hydra takes backslashes as they are, but for those before a quote: these are doubled.
+    text = re.sub(r"(\\+)('|\Z)", r"\1\1\2", text).replace("'", r"\'")
+    return f"{key}='{text}'"
 
 
 def _at_home(word: str) -> str:
     key, _, value = word.partition("=")
     home = value.startswith("~") and key in ("hydra.run.dir", "hydra.sweep.dir")
-    return override(key, Path(value).expanduser()) if home else word
+    return quoted(key, str(Path(value).expanduser())) if home else word
 
 
 def _filters(overrides: Sequence[str]) -> bool:
     """Returns whether one of the methods has a filter of its own; True if none is named here."""
     names = [word.partition("=")[2] for word in overrides if word.startswith("+method=")]
     known = [name for name in ",".join(names).split(",") if name in available("method")]
-    return not known or any(file_content(f"method/{name}").get("filter") for name in known)
+    return not known or any(
+        composed([NO_TASK, f"+method={name}"]).filter is not None for name in known
+    )
 
 
 def _word(parsed: Override) -> str:
@@ -113,6 +130,8 @@ def _word(parsed: Override) -> str:
     word, group = str(parsed.input_line), parsed.key_or_group
     value: Any = parsed.value()
     values = value.list if parsed.is_choice_sweep() else [value]
+    if word.startswith(BUILT):
+        return f"++{word}"
     if parsed.is_delete() or not (CONFIG_FOLDER / group).is_dir():
         return word
     if None in values and group in NOTHING:
@@ -163,13 +182,13 @@ def check_groups(given: Sequence[str]) -> None:
     said = dict(override.split("=", 1) for override in given if "=" in override)
     task, scale = said.get("task"), said.get("+scale")
     if task in available("task") and scale in available("scale"):
-        defaults = yaml_file("train")["defaults"]
-        scaled = next(group["task"] for group in defaults if "task" in group)
+        defaults = OmegaConf.load(CONFIG_FOLDER / "train.yaml").defaults
+        scaled = next(group.task for group in defaults if "task" in group)
         if task != scaled:
             raise ConfigError(
                 f"+scale={scale}: is of task={scaled}; task={task} has numbers of its own"
             )
-    if arranged(given) != [*given]:  # a sweep's file has its own order
+    if _ordered(given) != [*given]:  # a sweep's file has its own order
         raise ConfigError(
             f"{' '.join(given)}: +method and +scale must come before what changes them"
         )
@@ -190,18 +209,3 @@ def check_chosen(config: DictConfig, hydra: Any) -> None:
                 f"{group}={name}: the first line of {group}/{name}.yaml must be '# @package "
                 "_global_', with no byte-order mark before it"
             )
-
-
-def explained(error: Exception) -> str:
-    """Returns one line on an error in composing: an unknown file or key with those that exist."""
-    if isinstance(error, MissingConfigException) and error.options:
-        return f"{error.missing_cfg_file}: unknown; choose one of: {', '.join(error.options)}"
-    if isinstance(error, OverrideParseException):
-        return f"{error.override}: {one_line(error)}"
-    cause: Any = error.__cause__
-    if isinstance(cause, ConfigAttributeError | ConfigKeyError):
-        holder = cause.parent_node
-        if isinstance(holder, DictConfig):
-            known = sorted(str(key) for key in holder if holder._get_full_key(key) != "hydra")
-            return f"{cause.full_key}: unknown; there are: {', '.join(known) or 'none'}"
-    return ": ".join(map(one_line, filter(None, (error, cause))))

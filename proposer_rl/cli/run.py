@@ -7,7 +7,6 @@ import platform
 import shlex
 import sys
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -15,18 +14,16 @@ from signal import Signals
 from typing import Any
 
 import torch
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
 
 from proposer_rl.cli.build import Made, build, parts
 from proposer_rl.cli.config import RunConfig, stored_config
 from proposer_rl.cli.errors import ConfigError, one_line, say
-from proposer_rl.cli.groups import Invocation
+from proposer_rl.cli.groups import Invocation, quoted
 from proposer_rl.cli.help import choices, needs
 from proposer_rl.cli.loggers import logger
 from proposer_rl.experiment import Experiment
 from proposer_rl.meta.workers import WorkersError
-from proposer_rl.recipes import CONFIG_FOLDER, override_value
+from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files
 from proposer_rl.runs.folder import PROPOSER, RunFolder, storage, write_atomically
 from proposer_rl.runs.process import Interrupted, Status, StopSignals, locked, processor
@@ -223,6 +220,7 @@ def identity(experiment: Experiment, config: RunConfig, asked: Invocation) -> di
         "seeds": config.seeds,
         "about": _about(config, asked.config_dir),
         "overrides": asked.overrides,
+        "settings": asked.settings,
         "arguments": {"config_dir": asked.config_dir, "pythonpath": asked.python_path},
         "solver_parameters": parameters // len(config.seeds),
         "device": f"{device.type} {name}".strip(),
@@ -244,16 +242,8 @@ def to_go_on(asked: Invocation) -> str:
     before = [f"PYTHONPATH={shlex.quote(paths)}"] if paths else []
     options = ["--config-dir", config] if config else []
     own = [word for word in asked.overrides if not word.startswith("+sweep=")]
-    words = shlex.join([*options, *own, f"hydra.run.dir={quoted(str(asked.folder))}"])
+    words = shlex.join([*options, *own, quoted("hydra.run.dir", str(asked.folder))])
     return " ".join([*before, "bin/train", words])
-
-
-def quoted(path: str) -> str:
-    """Returns a path as Hydra's grammar of overrides takes it, in quotes where it needs them."""
-    with suppress(HydraException):
-        if OverridesParser.create().parse_override(f"hydra.run.dir={path}").value() == path:
-            return path
-    return override_value(path)
 
 
 def _about(config: RunConfig, own: str | None) -> dict[str, str]:

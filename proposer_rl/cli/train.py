@@ -11,7 +11,8 @@ import json
 import os
 import sys
 import traceback
-from argparse import ArgumentParser
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +27,8 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from proposer_rl.cli.errors import UNFORESEEN, ConfigError, command, exit_code, one_line, refuse
-from proposer_rl.cli.groups import (
-    arranged,
-    check_chosen,
-    check_groups,
-    explained,
-    given_overrides,
-    invocation,
-)
-from proposer_rl.recipes import CONFIG_FOLDER, override
+from proposer_rl.cli.groups import arranged, check_chosen, check_groups, invocation, quoted
+from proposer_rl.recipes import CONFIG_FOLDER, composed, explained, plain_values
 from proposer_rl.runs.folder import FAILURE, RunFolder
 from proposer_rl.runs.process import InUseError, StopSignals, guard_output
 
@@ -101,7 +95,7 @@ def _main(hydra_config: DictConfig) -> float:
     signals = StopSignals()
     try:
         (path / FAILURE).unlink(missing_ok=True)  # a run that failed is tried again
-        asked = invocation(about, given_overrides(about), path)
+        asked = invocation(about, path)
         check_groups(asked.overrides)
         check_chosen(hydra_config, about)
         with signals:  # already now: amid imports is no place to stop
@@ -139,7 +133,22 @@ def _prepare_arguments() -> None:
             "as in: --config-dir my_conf task=hill"
         )
     options = [word for word in sys.argv[1:] if word not in read.overrides]
-    sys.argv[1:] = [*arranged(read.overrides), *options]
+    overrides = arranged(read.overrides)
+    if read.cfg == "job":
+        more = Path(read.config_dir).absolute() if read.config_dir else CONFIG_FOLDER
+        _show_settings([*overrides, f'hydra.searchpath=["file://{more}"]'], read)
+        sys.exit()
+    sys.argv[1:] = [*overrides, *options]
+
+
+def _show_settings(words: Sequence[str], read: Namespace) -> None:
+    """Prints the settings that words ask for, as Hydra does, and defaults that are in no file."""
+    from proposer_rl.methods import completed  # only now: it takes seconds
+
+    config = OmegaConf.create(completed(plain_values(composed(words))))
+    part: Any = OmegaConf.select(config, read.package or "")
+    text = OmegaConf.to_yaml(part, resolve=read.resolve) if OmegaConf.is_config(part) else part
+    print(str(text).rstrip())
 
 
 def _expanded(config: DictConfig, key: str) -> Path:
@@ -149,7 +158,7 @@ def _expanded(config: DictConfig, key: str) -> Path:
     if given.startswith("~"):
         with read_write(config.hydra), open_dict(config.hydra):
             OmegaConf.update(config, key, str(path))
-            config.hydra.overrides.hydra.append(override(key, path))  # for a sweep's jobs
+            config.hydra.overrides.hydra.append(quoted(key, str(path)))  # for a sweep's jobs
     return path.absolute()
 
 

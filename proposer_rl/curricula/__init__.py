@@ -55,7 +55,7 @@ def own(make: Callable[..., Any], **settings: Any) -> Recipe:
 
 
 def __getattr__(name: str) -> Callable[..., Recipe]:
-    return recipe_function("method", name)
+    return recipe_function("method", name, Modelled.around)
 
 
 def __dir__() -> list[str]:

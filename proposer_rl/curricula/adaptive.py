@@ -46,6 +46,7 @@ from proposer_rl.curricula.belief import Belief
 from proposer_rl.curricula.contract import Batch, Curriculum
 from proposer_rl.curricula.outcome_model import Predictions
 from proposer_rl.curricula.student import Student
+from proposer_rl.meta.assembly import Components
 from proposer_rl.settings import Count, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space, level_inputs
@@ -155,6 +156,11 @@ class AdaptiveMixture(Curriculum):
             {"level": self._last, "arm": torch.zeros(0, dtype=torch.int64)}, [0]
         )
         self._shown: dict[str, Any] = {}
+
+    @classmethod
+    def create(cls, run: Components, **settings: Any) -> AdaptiveMixture:
+        """Makes it for a run's space, and its target and inputs if it has any."""
+        return cls(run.task.space, run.optional("target"), run.optional("inputs"), **settings)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
         """Returns levels [n] of the three arms, in a random order."""

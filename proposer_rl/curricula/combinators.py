@@ -12,9 +12,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.contract import Batch, Curriculum, LearnedCurriculum, proposed
-from proposer_rl.curricula.scores import Scorer
+from proposer_rl.curricula.scores import OwnScore, Scorer, Source
 from proposer_rl.curricula.student import Student
-from proposer_rl.settings import ArgumentError, NotNegative, Positive, checked
+from proposer_rl.settings import ArgumentError, Count, NotNegative, Positive, checked
 from proposer_rl.streams import Streams
 
 
@@ -103,6 +103,19 @@ class Filtered(Combinator):
         self.needs = tuple(dict.fromkeys((*self.needs, *scorer.needs)))
         self.required_results = tuple(dict.fromkeys((*self.required_results, *scorer.plays_for)))
         self._scorer, self._times, self._temperature = scorer, times, temperature
+
+    @classmethod
+    def around(
+        cls,
+        curriculum: Curriculum,
+        *,
+        score: str | OwnScore = "learnability",
+        source: Source = "exact",
+        rollouts: Count = 8,
+        **settings: Any,
+    ) -> Filtered:
+        """Makes it with a scorer of these settings: see :class:`Scorer`."""
+        return cls(curriculum, Scorer(score, source, rollouts), **settings)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
         """Draws a larger batch from the curriculum, and returns the levels of it that are kept."""

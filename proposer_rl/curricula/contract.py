@@ -28,6 +28,7 @@ from tensordict import TensorDict, TensorDictBase, pad
 from proposer_rl.curricula.batches import restored, saved
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import first_episode_return, first_episode_success
+from proposer_rl.meta.assembly import Components
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels
@@ -129,6 +130,22 @@ class Curriculum:
     needs: tuple[str, ...] = ()
     required_results: tuple[str, ...] = ()
     state: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def create(cls, run: Components, **settings: Any) -> Curriculum:
+        """Makes it for a run, as commands and :class:`~proposer_rl.Teacher` do.
+
+        This one passes on the space of the task's levels. Override it to take something else of
+        the run: ``return cls(run.task.target, **settings)``.
+
+        Args:
+            run: the task, and the Proposer's settings.
+            settings: those that the configuration may have are the keyword-only arguments of this
+                method and, as it has ``**settings``, of the constructor.
+        """
+        make: Any = cls
+        made: Curriculum = make(run.task.space, **settings)
+        return made
 
     def propose(self, student: Student, count: int, rng: Streams) -> Levels | Batch:
         """Returns levels [n] for the student to train on next, with notes where it needs any.

@@ -10,6 +10,7 @@ from torch import Tensor
 from proposer_rl.curricula.batches import levels_in
 from proposer_rl.curricula.bins import BinCurriculum, along_axes
 from proposer_rl.curricula.student import Student
+from proposer_rl.meta.assembly import Components
 from proposer_rl.meta.first_order import TargetMeasure, bin_scores
 from proposer_rl.settings import Count, Decay, Positive, checked
 from proposer_rl.streams import Streams
@@ -57,6 +58,11 @@ class FirstOrderCurriculum(BinCurriculum):
         self._temperature, self.smoothing = temperature, smoothing
         self._target, self._target_levels = target, target_levels
         self._candidates, self._step, self._measure = candidates, step, measure
+
+    @classmethod
+    def create(cls, run: Components, **settings: Any) -> FirstOrderCurriculum:
+        """Makes it for a run's space and target."""
+        return cls(run.task.space, run.task.target, **settings)
 
     def score(self, student: Student, count: int, rng: Streams) -> None:
         """Scores every bin by fresh levels, and averages the scores over time."""

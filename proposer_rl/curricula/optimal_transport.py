@@ -11,6 +11,7 @@ from torch import Tensor
 
 from proposer_rl.curricula.bins import BinCurriculum, Measure, Probes
 from proposer_rl.curricula.student import Student
+from proposer_rl.meta.assembly import Components
 from proposer_rl.settings import ArgumentError, Count, Positive, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Space
@@ -82,6 +83,11 @@ class TransportCurriculum(BinCurriculum):
         self._probes = Probes(space, probes, measure)
         self._target = (target_shares.double() / target_shares.double().sum()).numpy()
         self._costs = squared_distances(space)
+
+    @classmethod
+    def create(cls, run: Components, **settings: Any) -> TransportCurriculum:
+        """Makes it for a run's space and the shares of its bins in the target."""
+        return cls(run.task.space, run.task.target_shares, **settings)
 
     def score(self, student: Student, count: int, rng: Streams) -> None:
         """Moves the distribution by the student's performance on the probes."""

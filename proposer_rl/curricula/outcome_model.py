@@ -41,6 +41,7 @@ from proposer_rl.curricula.batches import device_of, finite, saved
 from proposer_rl.curricula.combinators import Combinator
 from proposer_rl.curricula.contract import Batch, Curriculum, proposed
 from proposer_rl.curricula.student import ABILITIES, Student
+from proposer_rl.meta.assembly import Components
 from proposer_rl.settings import Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels
@@ -253,6 +254,16 @@ class Modelled(Combinator):
         self._model = OutcomeModel(labels=labels, ridge=ridge, half_life=half_life)
         self._has_observed = False  # whether anything since the last proposal
         self._seen = Predictions()
+
+    @classmethod
+    def around(cls, curriculum: Curriculum, run: Components, **settings: Any) -> Modelled:
+        """Makes it for the features of a run's levels.
+
+        Raises:
+            ArgumentError: if they have none.
+        """
+        run.task.features(run.task.space.sample(1, torch.Generator())[None])
+        return cls(curriculum, run.task.features, **settings)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
         """Returns what the curriculum proposes, with a student whose performance is predicted."""

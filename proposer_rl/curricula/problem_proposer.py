@@ -187,9 +187,9 @@ class FirstOrderProposer(ProblemProposer):
         settings: PPOSettings,
         *,
         probe_levels: int = 16,
-        target_levels: Count = 256,
-        step: Positive = 1.0,
-        measure: TargetMeasure = "log_success",
+        target_levels: Count,
+        step: Positive,
+        measure: TargetMeasure,
     ) -> None:
         super().__init__(space, target, agent, settings, probe_levels=probe_levels)
         self._target_levels, self._step, self._measure = target_levels, step, measure

@@ -34,6 +34,7 @@ from proposer_rl.curricula.batches import (
     unpacked,
 )
 from proposer_rl.curricula.buffer import (
+    Prioritization,
     ReplayRule,
     draw_slots,
     empty_buffer,
@@ -43,10 +44,11 @@ from proposer_rl.curricula.buffer import (
     rescore,
 )
 from proposer_rl.curricula.contract import Batch, Curriculum
-from proposer_rl.curricula.scores import Scored, Scorer, episodes, unseen
+from proposer_rl.curricula.scores import OwnScore, Scored, Scorer, Source, episodes, unseen
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import DivergedError
-from proposer_rl.settings import ArgumentError, Count, Positive, checked
+from proposer_rl.meta.assembly import Components
+from proposer_rl.settings import ArgumentError, Count, Positive, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space
 
@@ -96,6 +98,7 @@ class ReplayCurriculum(Curriculum):
         space: Distribution,
         scorer: Scorer,
         rule: ReplayRule | None = None,
+        edit: Edit | None = None,
         *,
         new_levels: dict[str, Annotated[list[float], Len(1)]] | None = None,
         capacity: Count = 4000,
@@ -104,7 +107,6 @@ class ReplayCurriculum(Curriculum):
         train_on_new: bool = False,
         synchronous: bool | None = None,
         edits: Annotated[int, Interval(ge=0, le=1_000_000)] = 0,
-        edit: Edit | None = None,
         parents: Parents = "batch",
         renew: bool = False,
         co_learnability: float = 0.0,
@@ -149,6 +151,27 @@ class ReplayCurriculum(Curriculum):
         self._before: dict[str, Tensor] = {}
         self._scored = 0  # new levels
         self._came_back = {"levels": 0, "replayed": 0}
+
+    @classmethod
+    def create(
+        cls,
+        run: Components,
+        *,
+        score: str | OwnScore = "positive_value_loss",
+        source: Source = "episodes",
+        rollouts: Count = 1,
+        prioritization: Prioritization = ReplayRule.prioritization,
+        temperature: Positive = ReplayRule.temperature,
+        best: Count | None = ReplayRule.best,
+        staleness: Share = ReplayRule.staleness,
+        **settings: Any,
+    ) -> ReplayCurriculum:
+        """Makes it for a run's space and edits: see :class:`Scorer` and :class:`ReplayRule`."""
+        rule = ReplayRule(
+            prioritization=prioritization, temperature=temperature, best=best, staleness=staleness
+        )
+        scorer = Scorer(score, source, rollouts)
+        return cls(run.task.space, scorer, rule, run.optional("edit"), **settings)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
         """Returns levels [n], replayed or new."""

@@ -8,9 +8,10 @@ import torch
 
 from proposer_rl.curricula.batches import device_of
 from proposer_rl.curricula.contract import Curriculum
-from proposer_rl.curricula.scores import Scorer
+from proposer_rl.curricula.scores import OwnScore, Scorer, Source
 from proposer_rl.curricula.student import Student
 from proposer_rl.learning import DivergedError
+from proposer_rl.meta.assembly import Components
 from proposer_rl.settings import Count, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels
@@ -71,6 +72,19 @@ class SelectionCurriculum(Curriculum):
         self._proposed = 0
         self.kept: Levels = space.sample(1, torch.Generator())[:0]  # [keep], by falling score
         self.scores = torch.zeros(0)  # float64 [keep]
+
+    @classmethod
+    def create(
+        cls,
+        run: Components,
+        *,
+        score: str | OwnScore = "learnability",
+        source: Source = "exact",
+        rollouts: Count = 8,
+        **settings: Any,
+    ) -> SelectionCurriculum:
+        """Makes it for a run's space, with a scorer: see :class:`Scorer`."""
+        return cls(run.task.space, Scorer(score, source, rollouts), **settings)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Levels:
         """Returns levels [n]: some of those kept, then new ones.

@@ -16,6 +16,7 @@ from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
 from proposer_rl.curricula.contract import Batch, Curriculum
 from proposer_rl.curricula.points import Place, Points
 from proposer_rl.curricula.student import Student
+from proposer_rl.meta.assembly import Components
 from proposer_rl.settings import Count, Positive, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Space
@@ -99,6 +100,12 @@ class SelfPacedCurriculum(Curriculum):
         self._episodes: list[dict[str, Tensor]] = []
         self._expected: float | None = None  # performance at the last step
         self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
+
+    @classmethod
+    def create(cls, run: Components, **settings: Any) -> SelfPacedCurriculum:
+        """Makes it for a run's space, its target and the shares of the bins in that."""
+        task = run.task
+        return cls(task.space, task.target, task.target_shares, **settings)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
         """Draws points from the Gaussian, and returns levels [n] there."""

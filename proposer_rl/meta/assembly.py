@@ -1,10 +1,10 @@
-"""A Proposer from its settings: its network, its actions and its environment."""
+"""The parts of a run, and a Proposer's network, actions and environment from its settings."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from annotated_types import Ge, Gt
 from torch import nn
@@ -14,8 +14,9 @@ from proposer_rl.learning import LearningSettings
 from proposer_rl.meta.actions import Actions, Mixture, ProblemChoices
 from proposer_rl.meta.env import SolverTrainingEnv, SolverView
 from proposer_rl.meta.rewards import Reward
+from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.models import ActorCritic, categorical, joint_categorical, normal, proposer
-from proposer_rl.settings import BY_KIND, settings
+from proposer_rl.settings import BY_KIND, ArgumentError, settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
@@ -78,6 +79,40 @@ class ProposerSettings:
     context: Annotated[int, Ge(1)] = 128
     hidden: Annotated[int, Ge(1)] = 128
     ppo: LearningSettings = LearningSettings(updates=3, epochs=16, gamma=1.0)
+
+
+Workers = tuple[WorkerSettings, Callable[[str], Task]]
+"""Other processes in which replicas of the Solver are trained, and what makes the task there.
+
+Given its device; it can be pickled.
+"""
+
+
+class Components(NamedTuple):
+    """The parts of a run that curricula are made of.
+
+    Attributes:
+        task: what is to be learnt: a :class:`~proposer_rl.Task`, or in a
+            :class:`~proposer_rl.Teacher` perhaps a space of levels alone.
+        proposer: the Proposer's settings.
+        seed: of the Solver, and of a Proposer's weights.
+        on_update: called with the number of an episode's updates after every one of the replicas
+            that are trained in this process.
+        workers: where else they are trained; None for this process.
+    """
+
+    task: Any
+    proposer: ProposerSettings
+    seed: int
+    on_update: Callable[[int], None] | None = None
+    workers: Workers | None = None
+
+    def optional(self, name: str) -> Any:
+        """Returns what the task has of a name, such as ``edit``, or None if it has none."""
+        try:
+            return getattr(self.task, name)
+        except (AttributeError, ArgumentError):  # the latter of a space without a target
+            return None
 
 
 def meta_env(

@@ -245,6 +245,12 @@ def _command(run: Run) -> str:
     # A task or curriculum of one's own that prl.train was given is in no override.
     if "~task" in words or not any(word.lstrip("+").startswith("method=") for word in words):
         return ""
+    if isinstance(settings := run.facts.get("settings"), dict):  # of prl.train
+        named = dict(word.lstrip("+").split("=", 1) for word in words)
+        kept = {key: value for key, value in settings.items() if key not in ("seed", "compute")}
+        given = {"task": named.pop("task", ""), "curriculum": named.pop("method"), **named}
+        call = ", ".join(f"{name}={value!r}" for name, value in {**given, "settings": kept}.items())
+        return f"prl.train({call}{')' if run.shared_by > 1 else ', seed=seed)  # seed='}"
     arguments = run.facts.get("arguments", {})
     paths, config = arguments.get("pythonpath"), arguments.get("config_dir")
     own = ("seed=", "seeds=", "hydra.", "+sweep=", "compute.", "logger")

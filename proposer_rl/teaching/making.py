@@ -1,22 +1,15 @@
-"""A curriculum by name for a space of levels, without a run and without Hydra."""
+"""A curriculum by name for a space of levels, without a run."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from pkgutil import resolve_name
+from collections.abc import Mapping
 from typing import Any
 
 from proposer_rl.curricula import Curriculum, LearnedCurriculum
-from proposer_rl.meta.assembly import ProposerSettings
-from proposer_rl.methods import Components, UnfitTaskError, around, make, recipe_settings
-from proposer_rl.recipes import (
-    Recipe,
-    as_recipe,
-    filter_content,
-    merged,
-    resolved,
-)
+from proposer_rl.meta.assembly import Components, ProposerSettings
+from proposer_rl.methods import around, asked, build, completed
+from proposer_rl.recipes import Recipe, as_recipe
 from proposer_rl.settings import ArgumentError, plain, shown
 from proposer_rl.teaching.identity import of_classes
 
@@ -25,39 +18,34 @@ def make_curriculum(
     curriculum: Recipe | Curriculum | str,
     space: Any,
     filter: Mapping[str, Any] | str | None,
-    seeds: Sequence[int],
+    seed: int,
 ) -> tuple[Curriculum, dict[str, Any]]:
     """Returns the curriculum on the levels of a space or task; by name, with its file's filter.
 
     Returns:
-        The curriculum; its name or class and all settings that were said of it, for JSON.
+        The curriculum; its name or class and all its settings, for JSON.
     """
     if isinstance(space, type) or not hasattr(space, "space"):
         raise ArgumentError(
             f"space={shown(space)}: must be Parameters, Items, LevelGenerator, MadeLevels or a task"
         )
-    run = Components(space, ProposerSettings(), seeds)
-    asked: dict[str, Any] = {}
+    run = Components(space, ProposerSettings(), seed)
     if isinstance(curriculum, Curriculum):
-        made, named, own = curriculum, of_classes(curriculum), {}
+        named, config = of_classes(curriculum), completed(asked(None, filter))
+        made = around(curriculum, config, run)
     else:
         recipe = as_recipe("curriculum", "method", curriculum)
-        named, asked = recipe.name, recipe_settings(recipe)
-        own = resolved(asked.pop("curriculum"))
-        try:
-            made = make(resolve_name(own.pop("_target_")), own, run)
-        except UnfitTaskError as error:
-            raise ArgumentError(f"curriculum={named}: {error}; give a task in its place") from error
+        named, config = recipe.name, completed(asked(recipe, filter))
+        made = build(config, run)
     if isinstance(made, LearnedCurriculum) and made.trains_replicas:
         raise ArgumentError(
             f"curriculum={type(made).__name__}: trains replicas of the learner; use "
             "proposer_rl.train, or SolverTrainingEnv for learners of your own"
         )
-    if filter is not None:
-        asked = merged(asked, filter_content(filter))
-    more = {key: asked[key] for key in ("filter", "model") if asked.get(key) is not None}
-    described = json.dumps(plain({"kind": named, **own, **more}), default=_name)
-    return around(made, more, run), json.loads(described)
+    own = config.pop("curriculum", {})
+    own.pop("_target_", None)
+    described = json.dumps(plain({"kind": named, **own, **config}), default=_name)
+    return made, json.loads(described)
 
 
 def _name(value: Any) -> str:

@@ -17,15 +17,15 @@ import pandas as pd
 from omegaconf import OmegaConf
 
 from proposer_rl.cli.build import parts
+from proposer_rl.cli.config import RunConfig, read_config
 from proposer_rl.experiment.continued import ContinuedLevels
 from proposer_rl.experiment.side_by_side import SideBySide
-from proposer_rl.recipes import CONFIG_FOLDER, override_value
+from proposer_rl.recipes import CONFIG_FOLDER, composed
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
 from research.benchmarks.results import Options, Result, Row, Spread, Table
 from research.benchmarks.sb3_peer import train_sb3
-from research.benchmarks.scales import composed
 from research.benchmarks.timing import threads
 
 EPISODES = 50  # of an evaluation, with the most probable actions
@@ -41,16 +41,18 @@ class Plain(NamedTuple):
     """
 
     frames: int
-    parameter: str
+    parameter: dict[str, Any]
     numbers: str | dict[str, Any]
 
 
 ENVIRONMENTS = {
-    "CartPole-v1": Plain(100_000, "gravity: {values: [9.8], target: 9.8}", "cartpole"),
-    "LunarLander-v3": Plain(200_000, "gravity: {values: [-10.0], target: -10.0}", "lunar_lander"),
+    "CartPole-v1": Plain(100_000, {"gravity": {"values": [9.8], "target": 9.8}}, "cartpole"),
+    "LunarLander-v3": Plain(
+        200_000, {"gravity": {"values": [-10.0], "target": -10.0}}, "lunar_lander"
+    ),
     "BipedalWalker-v3": Plain(
         500_000,
-        "hardcore: {values: [0], target: 0}",
+        {"hardcore": {"values": [0], "target": 0}},
         {
             "batch_size": 32,
             "ppo": {
@@ -112,7 +114,7 @@ def against_sb3(options: Options) -> Result:
 
 def train_ours(environment: str, seeds: Sequence[int], frames: int, episodes: int) -> list[Trained]:
     """Train Solvers of these seeds side by side on an environment's one level, and evaluate."""
-    config = composed(*_overrides(environment, seeds, frames, episodes))
+    config = _config(environment, seeds, frames, episodes)
     made = parts(config, StopSignals())
     sides = SideBySide(made.task, made.learner, made.curricula)
     like = made.task.evaluated_on["target"][0]
@@ -157,22 +159,23 @@ def _missing(
             yield [Trained(THEIRS, name, seed, *train_sb3(name, seed, frames, episodes))]
 
 
-def _overrides(environment: str, seeds: Sequence[int], frames: int, episodes: int) -> Iterator[str]:
+def _config(environment: str, seeds: Sequence[int], frames: int, episodes: int) -> RunConfig:
     _, parameter, numbers = ENVIRONMENTS[environment]
     if isinstance(numbers, str):
         conf: Any = OmegaConf.load(CONFIG_FOLDER / "task" / f"{numbers}.yaml")
         numbers = OmegaConf.to_container(conf.solver)  # type: ignore[assignment]
     solver: Any = numbers
-    yield from ("task=gymnasium", "+method=target", f"seeds={list(seeds)}")
-    yield from (f"task.env_id={environment}", f"+task.parameters={{{parameter}}}")
-    yield from ("task.success.kind=return", "+task.success.least=0.0")
-    yield from (f"task.evaluation.levels={episodes}", "task.evaluation.actions=most_probable")
     count = solver.get("batch_size", 8)
-    yield f"solver.batch_size={count}"
-    for key, value in solver["ppo"].items():
-        yield f"solver.ppo.{key}={override_value(value)}"
+    task = {
+        "env_id": environment,
+        "parameters": parameter,
+        "success": {"kind": "return", "least": 0.0},
+        "evaluation": {"levels": episodes, "actions": "most_probable"},
+    }
     updates = -(-frames // (count * solver["ppo"]["horizon"]))
-    yield f"schedule.updates={updates}"
+    own = {"task": task, "solver": {"batch_size": count, "ppo": solver["ppo"]}}
+    more = {"seeds": [*seeds], "schedule": {"updates": updates}}
+    return read_config(composed(["task=gymnasium", "+method=target"], own, more))
 
 
 def _compared(rows: Sequence[Trained]) -> Result:

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 
+from proposer_rl import recipes
 from proposer_rl.cli.build import Made, build, make_task, parts
 from proposer_rl.cli.config import RunConfig, read_config
+from proposer_rl.cli.groups import arranged
 from proposer_rl.learning import PPO
-from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.folder import RunFolder, read_csv
 from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
@@ -130,6 +129,4 @@ class Solvers:
 @cache
 def composed(*overrides: str) -> RunConfig:
     """The settings of a command line, checked."""
-    GlobalHydra.instance().clear()  # a command in the same process may have left its own
-    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
-        return read_config(compose("train", list(overrides)))
+    return read_config(recipes.composed(arranged(overrides)))

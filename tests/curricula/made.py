@@ -32,6 +32,7 @@ from proposer_rl.curricula import (
 )
 from proposer_rl.learning import PPOSettings
 from proposer_rl.meta.assembly import ProposerSettings
+from proposer_rl.meta.rewards import log_success_gain
 from proposer_rl.methods import Components, proposer
 from proposer_rl.models import (
     ActorCritic,
@@ -86,9 +87,8 @@ def paired(streams: Streams | None = None) -> PairedProposer:
 
 
 def first_order_proposer() -> FirstOrderProposer:
-    return FirstOrderProposer(
-        SPACE, TARGET, problem_agent(), SETTINGS, probe_levels=2, target_levels=3
-    )
+    numbers = {"probe_levels": 2, "target_levels": 3, "step": 1.0, "measure": "log_success"}
+    return FirstOrderProposer(SPACE, TARGET, problem_agent(), SETTINGS, **numbers)
 
 
 def learnt() -> ProposerCurriculum:
@@ -96,7 +96,7 @@ def learnt() -> ProposerCurriculum:
     settings = ProposerSettings(
         rollouts=2, meta_episode_length=2, action_repeat=1, validation_levels=4, probe_levels=2
     )
-    return proposer(Components(TASK, settings, [0]))
+    return proposer(Components(TASK, settings, 0), reward=log_success_gain)
 
 
 def frozen() -> ProposerCurriculum:

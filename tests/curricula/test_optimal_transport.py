@@ -15,7 +15,7 @@ from proposer_rl.curricula.optimal_transport import (
     step_towards,
 )
 from proposer_rl.meta.assembly import ProposerSettings
-from proposer_rl.methods import Components, make
+from proposer_rl.methods import Components, build
 from proposer_rl.tasks.mazes import SpecificationSpace
 from proposer_rl.tasks.mazes.maze_settings import DistributionSettings, SpaceSettings
 from proposer_rl.tasks.parameters import ParameterSpace, intervals
@@ -168,9 +168,10 @@ def test_the_mazes_target_is_rounded_to_bins() -> None:
 
 
 def test_a_task_that_does_not_know_where_its_target_is_is_refused() -> None:
-    parts = Components(SimpleNamespace(space=None), ProposerSettings(), [0])
-    with pytest.raises(TypeError, match="needs target_shares of a task, which SimpleNamespace"):
-        make(TransportCurriculum, {}, parts)
+    parts = Components(SimpleNamespace(space=None), ProposerSettings(), 0)
+    asked = {"curriculum": {"_target_": "proposer_rl.curricula.TransportCurriculum"}}
+    with pytest.raises(ValueError, match="needs target_shares of a task, which SimpleNamespace"):
+        build(asked, parts)
 
 
 @pytest.mark.parametrize("seed", [46, 105, 164])

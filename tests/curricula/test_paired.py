@@ -57,6 +57,6 @@ def test_the_antagonist_trains_on_the_same_levels_with_its_own_chance() -> None:
 def test_it_has_no_second_solver_whose_episodes_go_on() -> None:
     ppo = PPOSettings(horizon=8, continue_episodes=True)
     task = walk_task(solver=SolverSettings(batch_size=P, ppo=ppo))
-    components = Components(task, ProposerSettings(), [0])
+    components = Components(task, ProposerSettings(), 0)
     with pytest.raises(ArgumentError, match=r"^continue_episodes=True: the second Solver"):
-        methods.paired(components, 1, 1e-3, 0.1)
+        methods.paired(components)

@@ -51,8 +51,11 @@ def ppo(**settings: Any) -> PPOSettings:
 
 
 def proposer(task: Seen, **settings: Any) -> FirstOrderProposer:
-    own = task.space, task.target, agent(), ppo(**settings)
-    return FirstOrderProposer(*own, probe_levels=2, target_levels=3, measure="return")
+    return rewarded(task.space, task.target, agent(), ppo(**settings))
+
+
+def rewarded(*parts: Any) -> FirstOrderProposer:
+    return FirstOrderProposer(*parts, probe_levels=2, target_levels=3, step=1.0, measure="return")
 
 
 def filtered(curriculum: Curriculum, times: int) -> Curriculum:
@@ -128,7 +131,7 @@ def test_all_that_it_computes_with_is_on_the_tasks_device() -> None:
     begun, task = proposer(Seen(1, WANTED)), Seen(1, WANTED)
     begun.propose(taught(task), P, [Streams(0)])
     there = SimpleNamespace(sample=lambda count, generator: torch.full((count,), -1, device="meta"))
-    elsewhere = FirstOrderProposer(task.space, there, agent().to("meta"), PPOSettings())
+    elsewhere = rewarded(task.space, there, agent().to("meta"), PPOSettings())
     elsewhere.load_state_dict(begun.state_dict())
     assert all(bound.is_meta for bound in elsewhere._loss.buffers())
     moments = [

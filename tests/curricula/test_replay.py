@@ -10,7 +10,6 @@ import torch
 from tensordict import TensorDict
 
 from proposer_rl.cli.build import parts
-from proposer_rl.cli.errors import ConfigError
 from proposer_rl.curricula import ReplayCurriculum, Scorer, Student, TaskStudent, outcome_of
 from proposer_rl.curricula.buffer import (
     ReplayRule,
@@ -23,6 +22,7 @@ from proposer_rl.curricula.replay import easiness
 from proposer_rl.curricula.scores import unseen
 from proposer_rl.learning import PPO, DivergedError
 from proposer_rl.runs.process import StopSignals
+from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from tests.curricula.living import TASK, live, solvers, student
 from tests.curricula.made import MADE, ncc, replay
@@ -320,5 +320,5 @@ def test_several_solvers_cannot_decide_by_themselves_what_to_play_on() -> None:
     with pytest.raises(ValueError, match="set synchronous=true"):
         live(robust(), solvers([0, 1]), [0, 1], range(1))
     config = composed("+method=robust_plr", "+scale=smoke", "+as=dcd", "seeds=[0,1]")
-    with pytest.raises(ConfigError, match="curriculum: 2 Solvers: each would decide by itself"):
+    with pytest.raises(ArgumentError, match="curriculum: 2 Solvers: each would decide by itself"):
         parts(config, StopSignals())  # before anything is written

@@ -99,6 +99,19 @@ def test_commands_join_the_seeds_that_differ_in_nothing_else(tmp_path: Path) -> 
     ]
 
 
+def test_a_run_from_python_is_told_as_it_was_called(tmp_path: Path) -> None:
+    settings = {"curriculum": {"temperature": 0.5}, "seed": 0, "compute": {"progress": False}}
+    words = ["task=maze", "+method=plr", "+scale=smoke"]
+    for seed in (0, 1):
+        facts = {"overrides": words, "settings": {**settings, "seed": seed}}
+        write_run(tmp_path / str(seed), "plr", [seed], facts=facts)
+    (study,), _ = read(tmp_path)
+    own = "settings={'curriculum': {'temperature': 0.5}}"
+    assert commands(study) == [
+        f"prl.train(task='maze', curriculum='plr', scale='smoke', {own}, seed=seed)  # seed=0,1"
+    ]
+
+
 def test_a_command_names_the_paths_that_it_was_given(tmp_path: Path) -> None:
     arguments = {"config_dir": "/home/somebody/my conf", "pythonpath": "/home/x/code:/srv/y/lib"}
     overrides = ["+method=mine", "task.file=/data/z/levels.txt"]
@@ -133,7 +146,7 @@ def test_seeds_that_were_trained_side_by_side_are_again(tmp_path: Path) -> None:
     [
         {"overrides": None},
         # As prl.train records a task, or a curriculum, of one's own.
-        {"overrides": ["~task", "+method=plr", "seed=0"]},
+        {"overrides": ["~task", "+method=plr"], "settings": {"seed": 0}},
         {"overrides": ["task=maze", "+scale=smoke", "seed=0"]},
     ],
 )

@@ -519,7 +519,11 @@ UNFIT: list[tuple[Callable[[], Any], type[Exception], str]] = [
         for name, needs in NEEDS.items()
     ),
     *(
-        (lambda n=name: prl.Teacher(recipe(n), SPACE), ArgumentError, f"curriculum={name}: needs")
+        (
+            lambda n=name: prl.Teacher(recipe(n), SPACE),
+            ArgumentError,
+            "curriculum: needs .* of a task",
+        )
         for name in ("perf_gain", "task_difficulty", "paired", "first_order_proposer")
     ),
     (lambda: prl.Teacher("target", NO_TARGET), ArgumentError, "target: missing"),
@@ -620,9 +624,8 @@ def test_a_model_reads_success_where_it_is_asked_to() -> None:
             teacher.required_results == ("success",)
             and teacher.state_dict()["of"]["curriculum"]["model"] == model
         )
-    assert recipe.overrides()[1:] == [
-        *("++model.labels='success'", "++model.half_life=5", "++curriculum.probes=1"),
-    ]
+    own = {"labels": "success", "half_life": 5}
+    assert recipe.settings == {"model": own, "curriculum": {"probes": 1}}
 
 
 def test_the_parts_of_a_curriculum_are_one_import_and_their_defaults_agree() -> None:

@@ -44,8 +44,8 @@ def make(
 
     task = make_task(settings)
     found = None if elsewhere is None else (elsewhere, make_in_worker)
-    parts = Components(task, settings.proposer, seeds=[0], workers=found)
-    return task, proposer(parts, reward)
+    parts = Components(task, settings.proposer, seed=0, workers=found)
+    return task, proposer(parts, reward=reward)
 
 
 def cycles(

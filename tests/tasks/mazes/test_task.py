@@ -85,7 +85,7 @@ def test_a_meta_step_waits_only_to_hear_the_action_and_whether_all_is_finite(
     reward, observe_agent
 ) -> None:
     maze = tiny_task(maze=replace(TASK.maze, observe_agent=observe_agent))
-    trainer = proposer(Components(maze, SMALL, seeds=[0]), reward).trainer
+    trainer = proposer(Components(maze, SMALL, seed=0), reward=reward).trainer
     assert trainer is not None
     env = trainer.env
     for module in env.solvers.agent.modules():
