@@ -254,13 +254,13 @@ def _command(run: Run) -> str:
     arguments = run.facts.get("arguments", {})
     paths, config = arguments.get("pythonpath"), arguments.get("config_dir")
     own = ("seed=", "seeds=", "hydra.", "+sweep=", "compute.", "logger")
-    kept = [word for word in words if not word.startswith(own)]
+    shown = [word for word in words if not word.startswith(own)]
     many, seeds = ["-m"], "seed="
     if run.shared_by > 1:
         many, seeds = [], f"seeds=[{_joined(run.config['seeds'])}]"
     before = [f"PYTHONPATH={shlex.quote(paths)}"] if paths else []
     options = ["--config-dir", config] if config else []
-    quoted = [shlex.quote(word) for word in [*options, *many, *kept, seeds]]
+    quoted = [shlex.quote(word) for word in [*options, *many, *shown, seeds]]
     return " ".join([*before, "bin/train", *quoted])
 
 
