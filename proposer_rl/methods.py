@@ -6,7 +6,7 @@ class of their own, and those with a Proposer.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -66,10 +66,11 @@ from proposer_rl.streams import Streams
 
 # What bad input raises in what a configuration names, which may be anybody's.
 CANNOT_BE_CALLED = (ValueError, TypeError, NameError)
-
-
-class UnfitTaskError(WholeKeyError):
-    """A curriculum asks for something that the task does not define."""
+# What is put around a curriculum, by the key of its settings.
+AROUND: dict[str, Callable[..., Curriculum]] = {
+    "filter": Filtered.around,
+    "model": Modelled.around,
+}
 
 
 def build(config: Mapping[str, Any], run: Components) -> Curriculum:
@@ -82,33 +83,29 @@ def build(config: Mapping[str, Any], run: Components) -> Curriculum:
         run: what the run has.
 
     Raises:
-        ArgumentError: with the key that is not allowed, and what is.
-        UnfitTaskError: if the task lacks what is asked of it.
+        ArgumentError: with the key that is not allowed, and what is; if the task lacks what is
+            asked of it.
     """
     make, settings = maker("curriculum", config["curriculum"])
-    try:
-        with within("curriculum", *CANNOT_BE_CALLED):
+    with within("curriculum", *CANNOT_BE_CALLED):
+        try:
             curriculum = make(run, **configured(make, settings))
-            if not isinstance(curriculum, Curriculum):
-                raise TypeError(f"must make a Curriculum, but makes {type(curriculum).__name__}")
-    except AttributeError as error:
-        if error.obj is not run.task:
-            raise
-        kind = type(run.task).__name__
-        raise UnfitTaskError(
-            f"curriculum: needs {error.name} of a task, which {kind} does not define"
-        ) from error
+        except AttributeError as error:
+            if error.obj is not run.task:
+                raise
+            said = f"needs {error.name} of a task, which {type(run.task).__name__} does not define"
+            raise TypeError(said) from error
+        if not isinstance(curriculum, Curriculum):
+            raise TypeError(f"must make a Curriculum, but makes {type(curriculum).__name__}")
     return around(curriculum, config, run)
 
 
 def around(curriculum: Curriculum, config: Mapping[str, Any], run: Components) -> Curriculum:
     """Returns a curriculum with the filter and the model around it that a configuration has."""
-    if (filter := config.get("filter")) is not None:
-        with within("filter", ValueError):
-            curriculum = Filtered.around(curriculum, **configured(Filtered.around, filter))
-    if (model := config.get("model")) is not None:
-        with within("model", ValueError):
-            curriculum = Modelled.around(curriculum, run, **configured(Modelled.around, model))
+    for key, make in AROUND.items():
+        if config.get(key) is not None:
+            with within(key, ValueError):
+                curriculum = make(curriculum, run, **configured(make, config[key]))
     return curriculum
 
 
@@ -118,7 +115,7 @@ def completed(config: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(curriculum, Mapping):
         make, _ = maker("curriculum", {"_target_": curriculum.get("_target_")})
         found["curriculum"] = {"_target_": None, **with_defaults(make, curriculum)}
-    for key, make in (("filter", Filtered.around), ("model", Modelled.around)):
+    for key, make in AROUND.items():
         if isinstance(config.get(key), Mapping):
             found[key] = with_defaults(make, config[key])
     return found
@@ -161,8 +158,8 @@ def asked(
     words, settings = filter_asked(filter)
     made = recipe or Recipe("method", "")
     config = composed([NO_TASK, *made.words, *words], made.settings, settings)
-    keys = [key for key in ("curriculum", "filter", "model") if config[key] is not None]
-    return {key: plain_values(config[key], resolve) for key in keys}
+    keys = ("curriculum", *AROUND)
+    return {key: plain_values(config[key], resolve) for key in keys if config[key] is not None}
 
 
 def mixture(run: Components, *, parts: dict[str, dict[str, Any]]) -> Mixed:

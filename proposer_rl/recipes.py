@@ -68,7 +68,7 @@ def own_recipe(group: Group, make: Callable[..., Any], **settings: Any) -> Recip
 
 
 def storable(key: str, value: Any) -> Any:
-    """Returns a value of Python's own, see :func:`~proposer_rl.settings.plain`, for JSON.
+    """Returns a value as JSON has it, with the dotted names of functions in their place.
 
     Raises:
         ArgumentError: naming the key, for a function that cannot be imported by its name, and for
@@ -76,25 +76,23 @@ def storable(key: str, value: Any) -> Any:
     """
     from proposer_rl.settings import plain, shown  # which help does without
 
-    if callable(value):
-        return _dotted(key, value)
-    if isinstance(value, Mapping):
-        return {plain(name): storable(f"{key}.{name}", inner) for name, inner in value.items()}
-    try:
-        return json.loads(json.dumps(plain(value)))
-    except TypeError:
+    def named(inner: Any) -> str:
+        if callable(inner):
+            return _dotted(key, inner)
         said = "must be a number, a text, a list or a mapping of such"
-        raise _refusal(f"{key}={shown(value)}: {said}") from None
+        raise _refusal(f"{key}={shown(value)}: {said}")
+
+    return json.loads(json.dumps(plain(value), default=named))
 
 
-def _dotted(name: str, function: Any) -> str:
-    module, qualified = function.__module__, getattr(function, "__qualname__", "<nameless>")
-    if module == "__main__" or "<" in qualified:
+def _dotted(key: str, function: Any) -> str:
+    dotted = f"{function.__module__}.{getattr(function, '__qualname__', '<nameless>')}"
+    if function.__module__ == "__main__" or "<" in dotted:
         raise _refusal(
-            f"{name}={module}.{qualified}: must be importable, as a class or function of a module "
-            "is, so that watch, eval and play can make it again"
+            f"{key}={dotted}: must be importable, as a class or function of a module is, so that "
+            "watch, eval and play can make it again"
         )
-    return f"{module}.{qualified}"
+    return dotted
 
 
 def available(group: str, folder: Path = CONFIG_FOLDER) -> list[str]:
@@ -140,52 +138,44 @@ def recipe_function(
         AttributeError: if there is no such file, with those that there are.
     """
     if name not in available(group):
-        known = ", ".join(available(group))
-        raise AttributeError(f"there is no {name!r}; there are: {known}")
-    from proposer_rl.settings import check_names  # which help does without
+        raise AttributeError(f"there is no {name!r}; there are: {', '.join(available(group))}")
+    from proposer_rl.settings import check_names, schema  # which help does without
 
-    settings = _settings(group, name, around)
-    parameters = [p for key in reversed(settings) for p in settings[key].values()]
+    words = _words(group, name)
+    known: dict[str, dict[str, Parameter]] = {}  # by the key that they stand below
+    if group == "task":
+        known["task"] = _over({}, composed(words).task)
+    else:
+        config = composed([NO_TASK, *words])
+        make, _ = maker("curriculum", {"_target_": config.curriculum._target_})
+        if around is not None and config.model is not None:
+            known["model"] = _over(schema(around), config.model)
+        known["curriculum"] = _over(schema(make), config.curriculum)
+    parameters = {name: p for own in reversed(known.values()) for name, p in own.items()}
 
-    def make(**given: Any) -> Recipe:
-        check_names(signature.parameters, given)
-        keys = {
-            key: {n: v for n, v in given.items() if n in known} for key, known in settings.items()
-        }
-        return Recipe(group, name, _words(group, name), {k: v for k, v in keys.items() if v})
+    def recipe(**given: Any) -> Recipe:
+        check_names(parameters, given)
+        by_key: dict[str, dict[str, Any]] = {}
+        for setting, value in given.items():
+            key = next(key for key in reversed(known) if setting in known[key])
+            by_key.setdefault(key, {})[setting] = value
+        return Recipe(group, name, words, by_key)
 
     about = next(comments(CONFIG_FOLDER / group / f"{name}.yaml"))
-    make.__name__ = make.__qualname__ = name
-    make.__doc__ = f"{about}\n\nThe file is conf/{group}/{name}.yaml."
-    signature = Signature(parameters, return_annotation=Recipe)
-    make.__signature__ = signature  # type: ignore[attr-defined]
-    return make
+    recipe.__name__ = recipe.__qualname__ = name
+    recipe.__doc__ = f"{about}\n\nThe file is conf/{group}/{name}.yaml."
+    signature = Signature([*parameters.values()], return_annotation=Recipe)
+    recipe.__signature__ = signature  # type: ignore[attr-defined]
+    return recipe
 
 
-def _settings(
-    group: Group, name: str, around: Callable[..., Any] | None
-) -> dict[str, dict[str, Parameter]]:
-    """Returns the settings that a file's recipe takes, by the key that they stand below."""
-    from proposer_rl.settings import schema
-
-    if group == "task":
-        file = plain_values(composed(_words(group, name)).task)
-        required = {"???": Parameter.empty}
-        takes = {
-            n: Parameter(n, Parameter.KEYWORD_ONLY, default=required.get(str(value), value))
-            for n, value in file.items()
-            if n != "_target_"
-        }
-        return {"task": takes}
-    config = composed([NO_TASK, *_words(group, name)])
-    named = {"_target_": config.curriculum._target_}
-    makers = {"curriculum": maker("curriculum", named)[0]}
-    if around is not None and config.model is not None:
-        makers["model"] = around
-    found = {}
-    for key, make in makers.items():
-        file = plain_values(config[key])
-        found[key] = {n: p.replace(default=file.get(n, p.default)) for n, p in schema(make).items()}
+def _over(known: Mapping[str, Parameter], file: DictConfig) -> dict[str, Parameter]:
+    """Returns the settings of a file, and those of what makes an object of it."""
+    found = dict(known)
+    for name, value in plain_values(file).items():
+        default = Parameter.empty if value == "???" else value  # to be given
+        found[name] = Parameter(name, Parameter.KEYWORD_ONLY, default=default)
+    found.pop("_target_", None)
     return found
 
 

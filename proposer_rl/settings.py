@@ -83,11 +83,10 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
         proposer_rl.settings.ArgumentError: temperature=0: input should be greater than 0
     """
     signature = inspect.signature(function)
-    known = {name: p for name, p in signature.parameters.items() if name != "self"}
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        check_names(known, kwargs, missing=False)
+        check_names(_parameters(function), kwargs, missing=False)
         bound = signature.bind(*args, **kwargs)
         bound.arguments.update(_checked_values(function, bound.arguments))
         return function(*bound.args, **bound.kwargs)
@@ -144,36 +143,35 @@ def arguments(
         ...
         proposer_rl.settings.ArgumentError: rat: unknown; there are: rate, source
     """
-    parameters = inspect.signature(function).parameters
-    check_names({name: p for name, p in parameters.items() if name not in ("self", *given)}, values)
+    known = {name: p for name, p in _parameters(function).items() if name not in given}
+    check_names(known, values)
     return _checked_values(function, values)
 
 
-@functools.cache
 def schema(make: Callable[..., Any]) -> dict[str, inspect.Parameter]:
     """Returns what a configuration may set of a function: its keyword-only arguments, by name.
 
     Where a class's method, such as ``Curriculum.create``, takes ``**settings``, these are the
     keyword-only arguments of the class's constructor.
     """
-    parameters = inspect.signature(make).parameters
-    found = {name: p for name, p in parameters.items() if p.kind >= p.KEYWORD_ONLY}
-    cls = getattr(make, "__self__", None)
-    for name, parameter in [*found.items()]:
-        if parameter.kind is parameter.VAR_KEYWORD and inspect.isclass(cls):
-            del found[name]
-            found |= schema(cls.__init__)
-    return found
+    return {name: p for name, p in _parameters(make).items() if p.kind >= p.KEYWORD_ONLY}
 
 
 def configured(make: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
     """Checks values against the :func:`schema` of a function, as :func:`arguments` does."""
     check_names(schema(make), values)
-    cls = getattr(make, "__self__", None)
-    constructor = [cls.__init__] if inspect.isclass(cls) else []
-    for function in (make, *constructor):
-        values = _checked_values(function, values)
-    return dict(values)
+    return _checked_values(make, values)
+
+
+@functools.cache
+def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    parameters = inspect.signature(function).parameters
+    found = {name: p for name, p in parameters.items() if name != "self"}
+    if inspect.isclass(cls := getattr(function, "__self__", None)):
+        for name in [name for name, p in found.items() if p.kind is p.VAR_KEYWORD]:
+            del found[name]
+            found |= schema(cls.__init__)
+    return found
 
 
 def with_defaults(make: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
@@ -235,10 +233,16 @@ def _checked_values(function: Callable[..., Any], values: Mapping[str, Any]) -> 
 
 @functools.cache
 def _adapters(function: Callable[..., Any]) -> dict[str, TypeAdapter[Any] | None]:
-    typed = function.__init__ if inspect.isclass(function) else function
-    hints = get_type_hints(typed, include_extras=True)
-    parameters = inspect.signature(function).parameters.values()
-    one_by_one = [p.name for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    cls = function if inspect.isclass(function) else getattr(function, "__self__", None)
+    typed = [function] if not inspect.isclass(cls) else [cls.__init__, function]
+    hints: dict[str, Any] = {}
+    for some in typed:
+        hints |= {} if inspect.isclass(some) else get_type_hints(some, include_extras=True)
+    one_by_one = [
+        name
+        for name, p in _parameters(function).items()
+        if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
+    ]
     return {name: _adapter(hints[name]) for name in one_by_one if name in hints}
 
 

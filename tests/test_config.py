@@ -194,15 +194,7 @@ def test_files_of_ones_own_are_found_below_config_dir(options: list[str], train,
 
 ALONE = ["+method=target"]
 GROUPS_AS_GIVEN = [
-    ([*ALONE, "logger=null"], [*ALONE, "logger=csv"]),
-    ([*ALONE, "filter=null"], ALONE),
-    (
-        ["+method=plr,first_order_gain", "filter=null"],
-        ["+method=plr,first_order_gain", "+filter=none"],
-    ),
     ([*ALONE, "curriculum.x=1", "~model.y"], [*ALONE, "++curriculum.x=1", "~model.y"]),
-    ([*ALONE, "+filter=learnability,null"], [*ALONE, "+filter=learnability,none"]),
-    ([*ALONE, "+ablation=null,x"], [*ALONE, "+ablation=none,x"]),
     (["+as=dcd", "seed=1", "+method=plr"], ["seed=1", "+method=plr", "+as=dcd"]),
     (["+filter=x", *ALONE, "+score=y", "+scale=z"], [*ALONE, "+scale=z", "+filter=x", "+score=y"]),
     (["task=a,b", "~filter", "filter={times: 3}"], ["task=a,b", "~filter", "filter={times: 3}"]),
@@ -216,7 +208,9 @@ def test_groups_come_in_the_order_in_which_none_is_undone(
     assert arranged(given_words) == taken == arranged(taken)
 
 
-@pytest.mark.parametrize("word", ["task=null", "+method=null", "compute=null", "+scale=3"])
+@pytest.mark.parametrize(
+    "word", ["task=null", "filter=null", "compute=null", "+filter=none,null", "+scale=3"]
+)
 def test_a_group_without_a_files_name_gets_one_line(word: str, train, capsys) -> None:
     """As of every other key, with what it takes (lightning-hydra-template#629)."""
     assert train("+method=target", word) == 2

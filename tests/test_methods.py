@@ -10,7 +10,7 @@ import pytest
 import proposer_rl as prl
 from proposer_rl.curricula import Curriculum, SamplingCurriculum, Student
 from proposer_rl.meta.assembly import Components, ProposerSettings
-from proposer_rl.methods import UnfitTaskError, build, completed
+from proposer_rl.methods import build, completed
 from proposer_rl.settings import ArgumentError, Count
 from proposer_rl.streams import Streams
 
@@ -94,7 +94,7 @@ def test_settings_that_are_not_allowed_are_refused(config: Any, message: str) ->
 
 
 def test_what_a_task_lacks_is_named_and_other_errors_are_as_they_are() -> None:
-    with pytest.raises(UnfitTaskError, match="needs target of a task, which SimpleNamespace does"):
+    with pytest.raises(ArgumentError, match="needs target of a task, which SimpleNamespace does"):
         build(made(OfTarget, score="a"), run_of(SimpleNamespace()))
     with pytest.raises(AttributeError, match="'int' object has no attribute 'x'"):
         build(made(asks_of_another), RUN)

@@ -132,10 +132,16 @@ def read_config(config: DictConfig) -> RunConfig:
     """Checks a composed configuration and returns it as settings, with all defaults."""
     if isinstance(config.get("task"), DictConfig) and "_target_" not in config.task:
         maker("task", {})  # before interpolations find less than what a task brings
-    values = completed(_resolved(config))
+    try:
+        values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        missing = isinstance(error, MissingMandatoryValue)
+        reason = "missing" if missing else str(error).splitlines()[0]
+        raise ConfigError(f"{error.full_key}: {reason}") from error
+    values = completed(values)
     if isinstance(values.get("task"), dict):  # before what is made of its values elsewhere
         task_maker(values["task"])
-    read = _settings(values)
+    read = RunConfig(**arguments(RunConfig, values))
     if read.checkpoint is not None and read.checkpoint not in read.curriculum.values():
         raise ConfigError(
             f"checkpoint={read.checkpoint}: method={read.method} takes none; "
@@ -172,7 +178,7 @@ def checked_config(values: Mapping[str, Any], file: Path) -> RunConfig:
     """Returns settings as a run stored them; where it is computed is left to choice."""
     free = {"compute": {"threads": 1, "progress": False}, "logger": {"type": "csv"}}
     try:
-        return _settings({**values, **free})
+        return RunConfig(**arguments(RunConfig, {**values, **free}))
     except (ValueError, TypeError, AttributeError, KeyError) as error:
         raise ConfigError(
             f"{file}: does not hold the settings of a run of this version: {error}"
@@ -185,17 +191,3 @@ def stored_config(file: Path) -> Any:
         return json.loads(read_bounded(file, LARGEST_FILE))
     except (ValueError, RecursionError):
         raise ConfigError(f"{file}: is no JSON of at most {LARGEST_FILE:,} bytes") from None
-
-
-def _resolved(config: DictConfig) -> Any:
-    """Returns plain values, with references replaced by what they refer to."""
-    try:
-        return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    except OmegaConfBaseException as error:
-        missing = isinstance(error, MissingMandatoryValue)
-        reason = "missing" if missing else str(error).splitlines()[0]
-        raise ConfigError(f"{error.full_key}: {reason}") from error
-
-
-def _settings(values: Mapping[str, Any]) -> RunConfig:
-    return RunConfig(**arguments(RunConfig, values))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,14 +17,12 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from proposer_rl.cli.errors import ConfigError
 from proposer_rl.cli.help import GROUPS
-from proposer_rl.recipes import CONFIG_FOLDER, NO_TASK, PACKAGE, available, composed
+from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, available
 
 # Files that change a method or a scale, and must come after it, since later files win.
 CHANGED = ("method", "scale")
 CHANGING = [group.strip("+=") for group in GROUPS if group.startswith("+")]
 CHANGING = [group for group in CHANGING if group not in (*CHANGED, "sweep")]
-# The files that stand for null, which Hydra does not take for a group.
-NOTHING = {"filter": "none", "ablation": "none", "logger": "csv"}
 # Keys below which are settings of curricula, most of which are in no file.
 BUILT = ("curriculum.", "filter.", "model.")
 # What a sweep's folders are not named after: where a run is computed and shown, and what has a
@@ -76,9 +74,8 @@ def _from_here(path: str) -> str:
 def arranged(overrides: Sequence[str]) -> list[str]:
     """Returns overrides in the order and spelling in which Hydra takes them.
 
-    Groups that change a method or a scale come after it. null for a group stands for its file that
-    changes nothing: ``logger=null`` is ``logger=csv``. Settings that have defaults in Python may be
-    in no file: ``filter.times=8`` is ``++filter.times=8``. A folder in the home folder may begin
+    Groups that change a method or a scale come after it. Settings that have defaults in Python may
+    be in no file: ``filter.times=8`` is ``++filter.times=8``. A folder in the home folder may begin
     with ``~``.
 
     Raises:
@@ -86,13 +83,11 @@ def arranged(overrides: Sequence[str]) -> list[str]:
         OverrideParseException: if one is not in Hydra's grammar.
     """
     words = [_at_home(word) for word in overrides]
-    found = [_word(parsed) for parsed in OverridesParser.create().parse_overrides(words)]
-    if "filter=null" in overrides and not _filters(found):
-        found.remove(f"+filter={NOTHING['filter']}")  # which labels the run as changed
-    return _ordered(found)
+    return _ordered(map(_spelled, OverridesParser.create().parse_overrides(words)))
 
 
-def _ordered(words: Sequence[str]) -> list[str]:
+def _ordered(given: Iterable[str]) -> list[str]:
+    words = list(given)
     groups = [word.partition("=")[0].lstrip("+") for word in words]
     end = max((place for place, group in enumerate(groups) if group in CHANGED), default=-1) + 1
     early = {place for place in range(end) if groups[place] in CHANGING}
@@ -116,31 +111,17 @@ def _at_home(word: str) -> str:
     return quoted(key, str(Path(value).expanduser())) if home else word
 
 
-def _filters(overrides: Sequence[str]) -> bool:
-    """Returns whether one of the methods has a filter of its own; True if none is named here."""
-    names = [word.partition("=")[2] for word in overrides if word.startswith("+method=")]
-    known = [name for name in ",".join(names).split(",") if name in available("method")]
-    return not known or any(
-        composed([NO_TASK, f"+method={name}"]).filter is not None for name in known
-    )
-
-
-def _word(parsed: Override) -> str:
+def _spelled(parsed: Override) -> str:
     """Returns an override as Hydra takes it, see :func:`arranged`."""
     word, group = str(parsed.input_line), parsed.key_or_group
-    value: Any = parsed.value()
-    values = value.list if parsed.is_choice_sweep() else [value]
     if word.startswith(BUILT):
         return f"++{word}"
-    if parsed.is_delete() or not (CONFIG_FOLDER / group).is_dir():
-        return word
-    if None in values and group in NOTHING:
-        names = [name.strip() for name in word.partition("=")[2].split(",")]
-        names = [NOTHING[group] if name.lower() == "null" else name for name in names]
-        return f"{'' if group == 'logger' else '+'}{group}={','.join(names)}"
-    if any(value is None or isinstance(value, int | float) for value in values):
-        choices = ", ".join(available(group))
-        raise ConfigError(f"{word}: names no file; choose one of: {choices}")
+    if (CONFIG_FOLDER / group).is_dir() and not parsed.is_delete():
+        value: Any = parsed.value()
+        values = value.list if parsed.is_choice_sweep() else [value]
+        if any(value is None or isinstance(value, int | float) for value in values):
+            choices = ", ".join(available(group))
+            raise ConfigError(f"{word}: names no file; choose one of: {choices}")
     return word
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from proposer_rl.curricula.contract import Batch, Curriculum, LearnedCurriculum, proposed
 from proposer_rl.curricula.scores import OwnScore, Scorer, Source
 from proposer_rl.curricula.student import Student
+from proposer_rl.meta.assembly import Components
 from proposer_rl.settings import ArgumentError, Count, NotNegative, Positive, checked
 from proposer_rl.streams import Streams
 
@@ -108,6 +109,7 @@ class Filtered(Combinator):
     def around(
         cls,
         curriculum: Curriculum,
+        run: Components,
         *,
         score: str | OwnScore = "learnability",
         source: Source = "exact",

@@ -246,10 +246,10 @@ def _command(run: Run) -> str:
     if "~task" in words or not any(word.lstrip("+").startswith("method=") for word in words):
         return ""
     if isinstance(settings := run.facts.get("settings"), dict):  # of prl.train
-        named = dict(word.lstrip("+").split("=", 1) for word in words)
-        kept = {key: value for key, value in settings.items() if key not in ("seed", "compute")}
+        named: dict[str, Any] = dict(word.lstrip("+").split("=", 1) for word in words)
         given = {"task": named.pop("task", ""), "curriculum": named.pop("method"), **named}
-        call = ", ".join(f"{name}={value!r}" for name, value in {**given, "settings": kept}.items())
+        given["settings"] = {k: v for k, v in settings.items() if k not in ("seed", "compute")}
+        call = ", ".join(f"{name}={value!r}" for name, value in given.items())
         return f"prl.train({call}{')' if run.shared_by > 1 else ', seed=seed)  # seed='}"
     arguments = run.facts.get("arguments", {})
     paths, config = arguments.get("pythonpath"), arguments.get("config_dir")
