@@ -141,7 +141,7 @@ class AdaptiveMixture(Curriculum):
         one = space.sample(1, torch.Generator())
         items = 0 if self._items(one) is None else space.size
         expected = getattr(space, "expected", None)
-        width = self._inputs(one).shape[-1]
+        width = self._known(one).shape[-1]
         self._belief = Belief(width, items, expected=expected, half_life=half_life)
         self._sums = torch.zeros(len(ARMS), len(SUMS), dtype=torch.float64)
         self._best = torch.zeros((), dtype=torch.float64)  # success on the target, b

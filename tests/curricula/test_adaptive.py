@@ -34,6 +34,7 @@ from proposer_rl.curricula.adaptive import (
     assigned,
     together,
 )
+from proposer_rl.curricula.contract import proposed
 from proposer_rl.curricula.outcome_model import LOGGED
 from proposer_rl.streams import Streams
 from proposer_rl.task import level_inputs
@@ -46,12 +47,11 @@ Plays = Callable[[Any, torch.Generator], Reached]
 def teach(
     curriculum: Curriculum, play: Plays, updates: int, count: int = 32, first: int = 0
 ) -> list[Any]:
-    """Returns what was proposed, [1, n], and what came of it, batch by batch."""
+    """Returns what was proposed, [n], and what came of it, batch by batch."""
     seen = []
     for number in range(first, first + updates):
-        batch = curriculum.propose(Student(), count, [Streams(0, number)])
-        reached = play(batch.levels[0], torch.Generator().manual_seed(number))
-        outcome = TensorDict({name: one[None] for name, one in reached.items()}, [1, count])
+        batch = proposed(curriculum, Student(), count, Streams(0, number))
+        outcome = TensorDict(play(batch.levels, torch.Generator().manual_seed(number)), [count])
         curriculum.observe(Student(), batch, outcome)
         seen.append((batch, outcome))
     return seen
@@ -59,7 +59,7 @@ def teach(
 
 def following(curriculum: Curriculum, count: int = 32) -> tuple[Batch, dict[str, Any]]:
     """Returns the next batch, and what is logged then."""
-    batch = curriculum.propose(Student(), count, [Streams(1, 0)])
+    batch = curriculum.propose(Student(), count, Streams(1, 0))
     return batch, json.loads(json.dumps({**curriculum.log(), "levels": 0}, allow_nan=False))
 
 
@@ -81,19 +81,19 @@ def covariances(a: Tensor, b: Tensor, weight: Tensor) -> tuple[float, float, flo
 
 def by_hand(seen: list[Any], told: bool) -> list[float]:
     """Returns the shares after a history, from weights by age: the module's formulas."""
-    returns = torch.cat([outcome["return"] for _, outcome in seen], 1)[0]
+    returns = torch.cat([outcome["return"] for _, outcome in seen])
     rows: list[tuple[float, int, float, float, float]] = []  # batch, arm, label, predicted, return
     every_return: list[float] = []
     best = []
     for number, (batch, outcome) in enumerate(seen):
-        came = outcome["return"][0].tolist()
+        came = outcome["return"].tolist()
         every_return = sorted([*every_return, *came])
         few = len(every_return) // 1000
         low, high = every_return[few], every_return[-1 - few]
         labels = [min(max((one - low) / (high - low), 0), 1) for one in came]
         if told:
-            labels = outcome["success"][0].tolist()
-        arms, predicted = (batch.notes[name][0].tolist() for name in ("arm", "predicted"))
+            labels = outcome["success"].tolist()
+        arms, predicted = (batch.notes[name].tolist() for name in ("arm", "predicted"))
         rows += zip([number] * len(arms), arms, labels, predicted, came, strict=True)
         own = [(2 ** ((r[0] - number) / 6), r[2]) for r in rows if r[1] == TARGET]
         best.append(sum(w * won for w, won in own) / (sum(w for w, _ in own) + 4))
@@ -133,7 +133,7 @@ def test_shares_are_those_of_the_formulas(told: bool) -> None:
         seen += teach(curriculum, play, 1, 24 if told else 70, now)  # more than a thousand in all
         log = following(curriculum)[1]
         expected = by_hand(seen, told)
-        shares = [log["shares"][arm][0] for arm in ("target", "uniform", "bridge")]
+        shares = [log["shares"][arm] for arm in ("target", "uniform", "bridge")]
         assert shares == pytest.approx(expected, abs=1e-9)
 
 
@@ -169,13 +169,10 @@ def test_parts_of_large_batches_are_learned_from_together(
     sizes: list[int], parts: list[int], expected: list[tuple[int, float]]
 ) -> None:
     numbers = torch.arange(sum(parts)).split(parts)
-    came = [
-        TensorDict({"size": torch.full((2, m), size), "at": number.expand(2, -1)}, [2, m])
-        for size, m, number in zip(sizes, parts, numbers, strict=True)
-    ]
+    came = [{"size": size, "return": number} for size, number in zip(sizes, numbers, strict=True)]
     joined = together(came)
-    assert [(len(part["at"][0]), pytest.approx(share)) for part, share in joined] == expected
-    assert torch.cat([part["at"] for part, _ in joined], 1)[1].equal(torch.arange(sum(parts)))
+    assert [(len(part["return"]), pytest.approx(share)) for part, share in joined] == expected
+    assert torch.cat([part["return"] for part, _ in joined]).equal(torch.arange(sum(parts)))
 
 
 @pytest.mark.parametrize("count", [64, 8 * LARGE])
@@ -184,7 +181,7 @@ def test_the_way_is_mastered_and_nearer_to_the_target_than_uniform_levels(count:
     curriculum = AdaptiveMixture(LINE, LINE.target)
     teach(curriculum, below(0.5), 12)
     batch, _ = following(curriculum, count)
-    arm, p, x = batch.notes["arm"][0], batch.notes["predicted"][0], batch.levels["x"][0]
+    arm, p, x = batch.notes["arm"], batch.notes["predicted"], batch.levels["x"]
     assert len(x[arm == BRIDGE].unique()) == (arm == BRIDGE).sum() > count / 8
     assert (p[arm == BRIDGE] >= 0.3 - 1e-9).all()
     assert (x[arm == TARGET] == 1).all()
@@ -196,7 +193,7 @@ def test_where_too_few_are_mastered_the_best_take_their_place() -> None:
     curriculum = AdaptiveMixture(LINE, LINE.target)
     teach(curriculum, below(0.02), 12)
     batch, _ = following(curriculum, 512)
-    arm, p = batch.notes["arm"][0], batch.notes["predicted"][0]
+    arm, p = batch.notes["arm"], batch.notes["predicted"]
     assert (p < 0.3).all() and p[arm == BRIDGE].mean() > 1.3 * p[arm == UNIFORM].mean()
 
 
@@ -205,7 +202,7 @@ def shares_after(play: Plays, space: Any = LINE, updates: int = 12) -> dict[str,
     curriculum = AdaptiveMixture(space, target)
     teach(curriculum, play, updates)
     log = following(curriculum)[1]
-    shares = {name: share for name, (share,) in log["shares"].items()}
+    shares: dict[str, float] = log["shares"]
     assert sum(shares.values()) == pytest.approx(1) and min(shares.values()) >= 0
     return shares
 
@@ -244,7 +241,7 @@ def test_returns_alone_tell_what_is_mastered_and_where_success_is_rare_too() -> 
         curriculum = AdaptiveMixture(LINE, LINE.target)
         teach(curriculum, play, 12)
         batch, _ = following(curriculum, 64)
-        p, x = batch.notes["predicted"][0], batch.levels["x"][0]
+        p, x = batch.notes["predicted"], batch.levels["x"]
         assert torch.corrcoef(torch.stack([p, x]))[0, 1] < -0.8
         if told:  # as half of a success at most
             assert float(p.max()) < 0.6
@@ -264,8 +261,8 @@ def test_an_episode_that_went_wrong_does_not_make_all_others_look_alike(wrong: f
     for now in range(12):
         teach(curriculum, play, 1, 256, now)
     batch, _ = following(curriculum, 512)
-    some = batch.notes["arm"][0] == UNIFORM
-    p, x = batch.notes["predicted"][0, some], batch.levels["x"][0, some]
+    some = batch.notes["arm"] == UNIFORM
+    p, x = batch.notes["predicted"][some], batch.levels["x"][some]
     assert float(p.std()) > 0.6 * float(x.std()) > 0.1
     assert torch.corrcoef(torch.stack([p, x]))[0, 1] > 0.9
 
@@ -325,16 +322,16 @@ def test_items_are_remembered_one_by_one() -> None:
         won = (levels["item"] % 2).double()
         return {"return": won, "success": won, "episodes": torch.full_like(won, 8)}
 
-    seen = [batch.levels["item"][0] for batch, _ in teach(curriculum, odd, 30, 256)]
+    seen = [batch.levels["item"] for batch, _ in teach(curriculum, odd, 30, 256)]
     batch, log = following(curriculum, 2048)
-    arm, item, p = batch.notes["arm"][0], batch.levels["item"][0], batch.notes["predicted"][0]
+    arm, item, p = batch.notes["arm"], batch.levels["item"], batch.notes["predicted"]
     known = torch.isin(item, torch.cat(seen))
     failed = torch.isin(item, torch.cat(seen[-10:])) & (item % 2 == 0)
     bridge, uniform = (float(failed[arm == one].double().mean()) for one in (BRIDGE, UNIFORM))
     assert bridge < 0.7 * uniform  # of what failed long ago a few are tried again
     assert p[known & (item % 2 == 1)].mean() > p[~known].mean() > p[known & (item % 2 == 0)].mean()
     assert (item[arm == TARGET] < 20).all()
-    assert log["shares"]["bridge"][0] > 0
+    assert log["shares"]["bridge"] > 0
 
 
 PARTS: dict[str, Any] = {
@@ -402,8 +399,8 @@ def test_any_space_will_do_with_a_target_or_without(space: Any) -> None:
         late = [one for one in late if one not in ids]
     teacher.propose(24)
     shares = teacher.log()["shares"]
-    assert ("target" in space.distributions) == (shares["target"][0] > 0)
-    assert sum(share for (share,) in shares.values()) == pytest.approx(1)
+    assert ("target" in space.distributions) == (shares["target"] > 0)
+    assert sum(shares.values()) == pytest.approx(1)
 
 
 class Learner:
@@ -455,13 +452,13 @@ def test_the_brier_score_is_of_success_also_where_the_belief_learns_from_returns
     curriculum = AdaptiveMixture(LINE, LINE.target)
     seen = teach(curriculum, below(-1.0), updates=12)  # returns differ, nobody succeeds
     _, log = following(curriculum)
-    predicted = torch.cat([batch.notes["predicted"] for batch, _ in seen], 1)
-    assert log["brier"] == [pytest.approx(float(predicted.square().mean()))]
-    assert log["brier_constant"] == [0.0]
+    predicted = torch.cat([batch.notes["predicted"] for batch, _ in seen])
+    assert log["brier"] == pytest.approx(float(predicted.square().mean()))
+    assert log["brier_constant"] == 0.0
 
 
 def test_what_nobody_logs_does_not_pile_up() -> None:
     curriculum = AdaptiveMixture(LINE, LINE.target)
     teach(curriculum, below(0.5), updates=LOGGED + 20, count=4)
     _, log = following(curriculum, 4)
-    assert sum(log["reliability"]["levels"][0]) == 4 * LOGGED
+    assert sum(log["reliability"]["levels"]) == 4 * LOGGED

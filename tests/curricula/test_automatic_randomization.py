@@ -50,8 +50,8 @@ class Simulated:
 def test_points_become_levels_of_the_nearest_bins_on_grids_and_elsewhere(space: Any) -> None:
     draw = torch.Generator().manual_seed(0)
     points = torch.cat([2 * torch.rand(200, 2, generator=draw) - 1, torch.tensor([[0.25, -0.75]])])
-    _, bins = Points(space, True).levels(points.double()[None], [Streams(0)])
-    assert bins[0].equal(nearest(points.double(), space.coordinates.double()))
+    _, bins = Points(space, True).levels(points.double(), Streams(0))
+    assert bins.equal(nearest(points.double(), space.coordinates.double()))
 
 
 @pytest.mark.parametrize("count", [3, 16])
@@ -61,47 +61,42 @@ def test_bounds_move_as_in_a_simulation(count: int) -> None:
     curriculum = BoundsCurriculum(
         SPACE, start=start, step=STEP, lower=0.3, upper=0.7, episodes=EPISODES, rounded=False
     )
-    simulated, batches, seen = [Simulated(start) for _ in range(2)], [], set()
+    simulated, batches, seen = Simulated(start), [], set()
     keys = [(axis, side) for axis in ("a", "b") for side in ("low", "high")]
     for update in range(480 // count):
-        batch = curriculum.propose(Student(), count, [Streams(s, update) for s in (0, 1)])
-        found = curriculum.bounds.flatten(1).tolist()
-        assert found == [[own.bounds[key] for key in keys] for own in simulated]
-        seen |= {tuple(found[0])}
-        for k, own in enumerate(simulated):
-            for name, low, high in (("a", 0.0, 10.0), ("b", -1.0, 1.0)):
-                places = 2 * (batch.levels[name][k] - low) / (high - low) - 1
-                assert (places >= own.bounds[name, "low"] - 1e-12).all()
-                assert (places <= own.bounds[name, "high"] + 1e-12).all()
+        batch = curriculum.propose(Student(), count, Streams(1, update))
+        found = curriculum.bounds.flatten().tolist()
+        assert found == [simulated.bounds[key] for key in keys]
+        seen |= {tuple(found)}
+        for name, low, high in (("a", 0.0, 10.0), ("b", -1.0, 1.0)):
+            places = 2 * (batch.levels[name] - low) / (high - low) - 1
+            assert (places >= simulated.bounds[name, "low"] - 1e-12).all()
+            assert (places <= simulated.bounds[name, "high"] + 1e-12).all()
         batches.append(batch)
         if len(batches) < 3:
             continue
         late = batches.pop(0)
-        levels = zip(late.levels["a"].flatten(), late.levels["b"].flatten(), strict=True)
-        told = torch.tensor([skill(float(a), float(b)) for a, b in levels]).view(2, count)
-        came = slice(0, None) if update != 4 else slice(0, count // 2)
-        for part in (slice(1, None, 2), slice(0, None, 2)):
-            some = torch.arange(count)[came][part]
-            outcome = reached(told[:, some], told[:, some])
-            curriculum.observe(Student(), late[:, some], outcome)
-        for k, own in enumerate(simulated):
-            for place, which in enumerate(late.notes["bound"][k, came].tolist()):
-                if which >= 0:
-                    at = float(late.notes["at"][k, place])
-                    own.play(keys[which], at, float(told[k, place]))
+        levels = zip(late.levels["a"], late.levels["b"], strict=True)
+        told = torch.tensor([skill(float(a), float(b)) for a, b in levels])
+        came = torch.arange(count)[slice(0, None) if update != 4 else slice(0, count // 2)]
+        for part in (came[: count // 3], came[count // 3 :]):
+            curriculum.observe(Student(), late[part], reached(told[part], told[part]))
+        for place, which in enumerate(late.notes["bound"][came].tolist()):
+            if which >= 0:
+                simulated.play(keys[which], float(late.notes["at"][place]), float(told[place]))
     assert len(seen) > 8
-    for own in simulated:  # within two steps of where the student fails
-        assert own.bounds["b", "low"] == -1.0 and -0.1 <= own.bounds["b", "high"] <= 1.0
-        assert -0.9 <= own.bounds["a", "low"] <= -0.1 and 0.3 <= own.bounds["a", "high"] <= 1.0
+    # Within two steps of where the student fails.
+    assert simulated.bounds["b", "low"] == -1.0 and -0.1 <= simulated.bounds["b", "high"] <= 1.0
+    assert -0.9 <= simulated.bounds["a", "low"] <= -0.1 and simulated.bounds["a", "high"] >= 0.3
 
 
 def test_levels_lie_on_bounds_as_often_as_asked_and_else_uniformly_within() -> None:
     curriculum = BoundsCurriculum(SPACE, boundary=0.4, rounded=False)
-    curriculum.propose(Student(), 1, [Streams(0)])
-    curriculum.bounds = torch.tensor([[[-0.5, 0.25], [0.0, 1.0]]]).double()
-    batch = curriculum.propose(Student(), 20_000, [Streams(1)])
-    places = torch.stack([batch.levels["a"][0] / 5 - 1, batch.levels["b"][0]], -1)
-    which = batch.notes["bound"][0]
+    curriculum.propose(Student(), 1, Streams(0))
+    curriculum.bounds = torch.tensor([[-0.5, 0.25], [0.0, 1.0]]).double()
+    batch = curriculum.propose(Student(), 20_000, Streams(1))
+    places = torch.stack([batch.levels["a"] / 5 - 1, batch.levels["b"]], -1)
+    which = batch.notes["bound"]
     shares = (which + 1).bincount(minlength=5) / 20_000
     torch.testing.assert_close(shares, torch.tensor([0.6, *[0.1] * 4]), atol=0.012, rtol=0)
     for bound, at in enumerate([-0.5, 0.25, 0.0, 1.0]):
@@ -117,15 +112,15 @@ def test_levels_lie_on_bounds_as_often_as_asked_and_else_uniformly_within() -> N
 
 
 def test_on_bins_it_goes_from_the_start_to_where_the_student_fails() -> None:
-    skills = torch.ones(2, 9)
-    skills[1, 6:] = 0.0
-    task = Scripted(skills, batch_size=24)
-    curriculum = BoundsCurriculum(task.space, start={"place": -1.0}, step=0.25, episodes=4)
-    first = step(curriculum, task, 0)
-    assert (first == 0).all()
-    for update in range(1, 40):
-        last = step(curriculum, task, update)
-    told = curriculum.log()
-    assert last[0].max() == 8 and 5 <= int(last[1].max()) <= 6 and last.min() == 0
-    assert told["width"][0] == 2.0 and 1.25 <= told["width"][1] <= 1.5
-    assert sum(told["histogram"]) == 2 * 40 * 24
+    for reached_last in (8, 5):
+        skills = torch.ones(9)
+        skills[reached_last + 1 :] = 0.0
+        task = Scripted(skills, batch_size=24)
+        curriculum = BoundsCurriculum(task.space, start={"place": -1.0}, step=0.25, episodes=4)
+        assert (step(curriculum, task, 0) == 0).all()
+        for update in range(1, 40):
+            last = step(curriculum, task, update)
+        told = curriculum.log()
+        assert reached_last <= int(last.max()) <= min(reached_last + 1, 8) and last.min() == 0
+        assert told["width"] == 2.0 if reached_last == 8 else 1.25 <= told["width"] <= 1.5
+        assert sum(told["histogram"]) == 40 * 24

@@ -106,27 +106,26 @@ def test_temperature_goes_from_the_best_alone_to_all_alike(kind: Any) -> None:
 
 
 def levels(*numbers: int) -> TensorDict:
-    """Levels [1, n] that are equal where their numbers are."""
-    shape = (1, len(numbers))
-    return TensorDict({"a": torch.tensor([numbers]), "b": torch.zeros(*shape, 2)}, shape)
+    """Levels [n] that are equal where their numbers are."""
+    count = len(numbers)
+    return TensorDict({"a": torch.tensor(numbers), "b": torch.zeros(count, 2)}, [count])
 
 
 def new(numbers: list[int], score: list[float], **more: Any) -> TensorDict:
     known = {"best": score, **more}
-    known = {name: torch.tensor([entry]) for name, entry in known.items()}
-    return TensorDict(
-        {"level": levels(*numbers), "score": torch.tensor([score]), **known}, (1, len(numbers))
-    )
+    known = {name: torch.tensor(entry) for name, entry in known.items()}
+    own = {"level": levels(*numbers), "score": torch.tensor(score)}
+    return TensorDict({**own, **known}, [len(numbers)])
 
 
 def filled(numbers: list[int], score: list[float], capacity: int, rule: ReplayRule) -> TensorDict:
-    buffer = empty_buffer(levels(0)[0, 0], 1, capacity)
+    buffer = empty_buffer(levels(0)[0], capacity)
     insert(buffer, new(numbers, score), rule)
     return buffer
 
 
 class Simulation:
-    """One Solver's buffer, in plain Python."""
+    """A buffer in plain Python."""
 
     def __init__(self, capacity: int, rule: ReplayRule) -> None:
         self.slots: list[dict[str, Any]] = []
@@ -177,13 +176,13 @@ def test_it_does_what_a_plain_simulation_does(data: st.DataObject) -> None:
         temperature=data.draw(st.sampled_from([0.1, 0.3, 1.0])),
         staleness=data.draw(st.sampled_from([0.0, 0.3, 0.9])),
     )
-    plain, buffer = Simulation(capacity, rule), empty_buffer(levels(0)[0, 0], 1, capacity)
+    plain, buffer = Simulation(capacity, rule), empty_buffer(levels(0)[0], capacity)
     for step in range(data.draw(st.integers(1, 8))):
         if plain.slots and data.draw(st.booleans()):
             generator = torch.Generator().manual_seed(step)
             marks = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
-            slots = draw_slots(buffer, 3, rule, [generator.manual_seed(step)])
-            assert slots[0].tolist() == [plain.draw(mark) for mark in marks]
+            slots = draw_slots(buffer, 3, rule, generator.manual_seed(step))
+            assert slots.tolist() == [plain.draw(mark) for mark in marks]
         else:
             numbers = data.draw(st.lists(st.integers(0, 9), min_size=1, max_size=4, unique=True))
             score = [data.draw(st.integers(-4, 4)) / 4 for _ in numbers]
@@ -191,8 +190,8 @@ def test_it_does_what_a_plain_simulation_does(data: st.DataObject) -> None:
             for number, value in zip(numbers, score, strict=True):
                 plain.insert(number, value)
         n = len(plain.slots)
-        assert buffer["filled"][0].tolist() == [True] * n + [False] * (capacity - n)
-        here = buffer[0, :n]
+        assert buffer["filled"].tolist() == [True] * n + [False] * (capacity - n)
+        here = buffer[:n]
         assert here["level", "a"].tolist() == [slot["number"] for slot in plain.slots]
         assert here["score"].tolist() == [slot["score"] for slot in plain.slots]
         assert here["touched"].tolist() == [slot["touched"] for slot in plain.slots]
@@ -202,20 +201,20 @@ def test_it_does_what_a_plain_simulation_does(data: st.DataObject) -> None:
 def test_what_is_evicted_leaves_nothing_behind() -> None:
     rule = replace(RANK, staleness=0.0)
     buffer = filled([1, 2], [0.5, 0.1], 2, rule)
-    draw_slots(buffer, 5, rule, [torch.Generator().manual_seed(0)])
+    draw_slots(buffer, 5, rule, torch.Generator().manual_seed(0))
     insert(buffer, new([3], [0.3], parent=[77], generation=[4]), rule)
-    assert buffer["level", "a"].tolist() == [[1, 3]]
-    row = buffer[0, 1]
+    assert buffer["level", "a"].tolist() == [1, 3]
+    row = buffer[1]
     assert (int(row["draws"]), int(row["parent"]), int(row["generation"])) == (0, 77, 4)
     assert float(row["best"]) == pytest.approx(0.3)
-    assert int(row["touched"]) == int(buffer["clock"][0, 1]) == 2 + 5 + 1  # age 0
+    assert int(row["touched"]) == int(buffer["clock"][1]) == 2 + 5 + 1  # age 0
 
 
 def test_what_was_reached_on_a_level_does_not_fall_when_it_comes_again() -> None:
     buffer = filled([1, 2], [0.9, 0.1], 4, RANK)
     insert(buffer, new([1, 2], [0.2, 0.8]), RANK)
-    assert buffer["score"][0, :2].tolist() == pytest.approx([0.2, 0.8])
-    assert buffer["best"][0, :2].tolist() == pytest.approx([0.9, 0.8])
+    assert buffer["score"][:2].tolist() == pytest.approx([0.2, 0.8])
+    assert buffer["best"][:2].tolist() == pytest.approx([0.9, 0.8])
 
 
 def test_a_level_that_does_not_beat_the_worst_is_not_kept() -> None:
@@ -223,7 +222,7 @@ def test_a_level_that_does_not_beat_the_worst_is_not_kept() -> None:
     buffer = filled([1, 2], [0.5, 0.1], 2, rule)
     for score in (0.1, -torch.inf, torch.nan):
         insert(buffer, new([3], [score]), rule)
-        assert buffer["level", "a"].tolist() == [[1, 2]]
+        assert buffer["level", "a"].tolist() == [1, 2]
 
 
 def test_equal_levels_of_a_batch_count_once_in_any_order() -> None:
@@ -238,18 +237,18 @@ def test_equal_levels_of_a_batch_count_once_in_any_order() -> None:
 
 def test_rescoring_takes_means_and_never_lowers_the_best_return() -> None:
     buffer = filled([1, 2, 3], [0.1, 0.2, 0.3], 4, RANK)
-    score = torch.tensor([[1.0, 2.0, -torch.inf]])
-    best = torch.tensor([[-9.0, 0.7, 0.0]])
-    rescore(buffer, torch.tensor([[0, 0, 2]]), score, best)
-    assert buffer["score"][0, :3].tolist() == pytest.approx([1.5, 0.2, 0.3])
-    assert buffer["best"][0, :3].tolist() == pytest.approx([0.7, 0.2, 0.3])
+    score = torch.tensor([1.0, 2.0, -torch.inf])
+    best = torch.tensor([-9.0, 0.7, 0.0])
+    rescore(buffer, torch.tensor([0, 0, 2]), score, best)
+    assert buffer["score"][:3].tolist() == pytest.approx([1.5, 0.2, 0.3])
+    assert buffer["best"][:3].tolist() == pytest.approx([0.7, 0.2, 0.3])
 
 
 @given(st.data())
 def test_of_many_at_once_the_best_stay(data: st.DataObject) -> None:
     """Against a sorted list: without staleness the buffer holds the best of all it was given."""
     capacity = data.draw(st.integers(1, 200))
-    rule, buffer = ReplayRule(staleness=0.0), empty_buffer(levels(0)[0, 0], 1, capacity)
+    rule, buffer = ReplayRule(staleness=0.0), empty_buffer(levels(0)[0], capacity)
     known: dict[int, float] = {}
     seed = data.draw(st.integers(0, 2**20))
     for start in (0, 100, 300):
@@ -270,22 +269,22 @@ def test_of_many_at_once_the_best_stay(data: st.DataObject) -> None:
                 del here[least]
             here[number] = value
         known = here
-        row = buffer[0][buffer["filled"][0]]
+        row = buffer[buffer["filled"]]
         found = dict(zip(row["level", "a"].tolist(), row["score"].tolist(), strict=True))
         assert found == pytest.approx(known)
-        assert len(row["key"].unique()) == len(row) and int(buffer["clock"][0, 0]) % 150 == 0
-        assert int(row["touched"].max()) <= int(buffer["clock"][0, 0])
+        assert len(row["key"].unique()) == len(row) and int(buffer["clock"][0]) % 150 == 0
+        assert int(row["touched"].max()) <= int(buffer["clock"][0])
 
 
 def test_many_draws_at_once_follow_scores_and_ages() -> None:
     buffer = filled([1, 2, 3, 4, 5], SCORE.tolist(), 9, RANK)
-    buffer["touched"][0, :5] = buffer["clock"][0, 0] - AGE
-    slots = draw_slots(buffer, 20_000, RANK, [torch.Generator().manual_seed(0)])
-    expected, counts = 20_000 * torch.tensor(TOGETHER), slots[0].bincount(minlength=5)
+    buffer["touched"][:5] = buffer["clock"][0] - AGE
+    slots = draw_slots(buffer, 20_000, RANK, torch.Generator().manual_seed(0))
+    expected, counts = 20_000 * torch.tensor(TOGETHER), slots.bincount(minlength=5)
     assert float(((counts - expected).square() / expected).sum()) < 18.5  # p = 0.001 at 4 degrees
-    assert buffer["draws"][0, :5].equal(counts)
-    last = [20_000 - int(slots[0].flip(0).eq(slot).nonzero()[0]) for slot in range(5)]
-    assert (buffer["touched"][0, :5] - 5).tolist() == last
+    assert buffer["draws"][:5].equal(counts)
+    last = [20_000 - int(slots.flip(0).eq(slot).nonzero()[0]) for slot in range(5)]
+    assert (buffer["touched"][:5] - 5).tolist() == last
 
 
 def test_keys_tell_levels_apart() -> None:

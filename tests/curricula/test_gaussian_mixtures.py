@@ -115,14 +115,14 @@ def small(task: Scripted, **options: Any) -> MixtureCurriculum:
 
 
 def test_a_warm_up_is_even_and_its_draws_are_rounded() -> None:
-    task = Scripted(torch.zeros(1, 5), batch_size=4000)
+    task = Scripted(torch.zeros(5), batch_size=4000)
     curriculum = small(task, warmup=4000, refit=4000)
-    bins = step(curriculum, task, 0)[0].bincount(minlength=5) / 4000
+    bins = step(curriculum, task, 0).bincount(minlength=5) / 4000
     curriculum.log()
     # The bins are half a unit apart, so that half of an outermost one lies outside of the box.
     np.testing.assert_allclose(bins, [1 / 8, 1 / 4, 1 / 4, 1 / 4, 1 / 8], atol=0.03)
     history = curriculum.state_dict()["history"]
-    points, tasks = history["points"][0, :, 0], history["tasks"][0, :, 0]
+    points, tasks = history["points"][:, 0], history["tasks"][:, 0]
     assert (points.abs() <= 1).all() and len(points.unique()) > 3900
     assert ((points - tasks).abs() <= 0.25).all() and len(tasks.unique()) == 5
 
@@ -130,13 +130,13 @@ def test_a_warm_up_is_even_and_its_draws_are_rounded() -> None:
 @pytest.mark.parametrize("source", ["episodes", "exact"])
 def test_the_mass_moves_to_what_is_learnt_and_leaves_when_it_is(source: str) -> None:
     """Bins 0 and 1 are learnt from update 10 to 29; the others never change."""
-    task = Scripted(torch.zeros(1, 8), batch_size=32)
+    task = Scripted(torch.zeros(8), batch_size=32)
     curriculum = small(task, source=source)
     shares = []
     for update in range(60):
-        task.skills = torch.zeros(1, 8)
-        task.skills[0, 5:] = 0.7
-        task.skills[0, :2] = min(max(update - 9, 0) / 20, 1.0)
+        task.skills = torch.zeros(8)
+        task.skills[5:] = 0.7
+        task.skills[:2] = min(max(update - 9, 0) / 20, 1.0)
         shares.append(float((step(curriculum, task, update) <= 1).double().mean()))
     even = 1.5 / 7  # of the box
     assert np.mean(shares[:8]) == pytest.approx(even, abs=0.15)
@@ -145,25 +145,25 @@ def test_the_mass_moves_to_what_is_learnt_and_leaves_when_it_is(source: str) -> 
 
 
 def test_progress_is_against_earlier_updates_alone() -> None:
-    task = Scripted(torch.zeros(1, 8), batch_size=8)
+    task = Scripted(torch.zeros(8), batch_size=8)
     curriculum = small(task)
-    returns = torch.rand(4, 1, 8, generator=torch.Generator().manual_seed(6)).double()
+    returns = torch.rand(4, 8, generator=torch.Generator().manual_seed(6)).double()
     for update in range(4):
-        batch = curriculum.propose(task, 8, [Streams(0, update)])
+        batch = curriculum.propose(task, 8, Streams(0, update))
         curriculum.observe(task, batch, reached(returns[update]))
     curriculum.log()
     history = curriculum.state_dict()["history"]
     # Seven steps between eight bins: a bin's number.
-    bins = ((history["tasks"][0, :, 0] + 1) * 3.5).round()
+    bins = ((history["tasks"][:, 0] + 1) * 3.5).round()
     earlier = returns.flatten()
     for row in range(8, 32):
         apart = (bins[: row // 8 * 8] - bins[row]).abs()
         neighbour = max(int(i) for i in (apart == apart.min()).nonzero())
-        assert float(history["progress"][0, row]) == pytest.approx(
+        assert float(history["progress"][row]) == pytest.approx(
             abs(float(earlier[row] - earlier[neighbour]))
         )
-    assert (history["progress"][0, :8] == 0).all()
-    torch.testing.assert_close(history["returns"][0], earlier)
+    assert (history["progress"][:8] == 0).all()
+    torch.testing.assert_close(history["returns"], earlier)
 
 
 def test_mixtures_are_made_of_the_last_window_when_it_is_full(
@@ -176,7 +176,7 @@ def test_mixtures_are_made_of_the_last_window_when_it_is_full(
         return fit_mixture(points, most, generator)
 
     monkeypatch.setattr(gaussian_mixtures, "fit_mixture", noted)
-    task = Scripted(torch.rand(1, 8), batch_size=24)
+    task = Scripted(torch.rand(8), batch_size=24)
     curriculum = small(task, warmup=70, refit=50)
     fitted = []
     for update in range(10):
@@ -185,47 +185,46 @@ def test_mixtures_are_made_of_the_last_window_when_it_is_full(
         fitted += [24 * update] * (len(made) - before)
     assert fitted == [72, 120, 168, 216]  # the first of at least 70, and each beyond a further 50
     history = curriculum.state_dict()["history"]
-    last = torch.cat([history["points"], history["progress"].unsqueeze(-1)], -1)[0, 216 - 50 : 216]
+    last = torch.cat([history["points"], history["progress"].unsqueeze(-1)], -1)[216 - 50 : 216]
     assert torch.equal(made[-1], last)
 
 
 def test_draws_beyond_the_box_are_clipped_and_told() -> None:
-    task = Scripted(torch.zeros(1, 5), batch_size=5000)
+    task = Scripted(torch.zeros(5), batch_size=5000)
     curriculum = small(task, exploration=0.3)
     state = curriculum.state_dict()
     means = torch.tensor([[0.9, 0.5]]).double()
     covariances = torch.diag(torch.tensor([0.01, 0.2])).double().unsqueeze(0)
-    state["mixtures"] = [(means, covariances)]
+    state["mixture"] = [means, covariances]
     curriculum.load_state_dict(state)
     step(curriculum, task, 0)
     told = json.loads(json.dumps(curriculum.log()))
     beyond = 0.5 * math.erfc(1 / math.sqrt(2))  # of a Gaussian, more than one deviation up
     assert told["clipped"] == pytest.approx(beyond, abs=0.02)
-    points = curriculum.state_dict()["history"]["points"][0, :, 0]
+    points = curriculum.state_dict()["history"]["points"][:, 0]
     assert float((points == 1).double().mean()) == pytest.approx(0.7 * beyond, abs=0.02)
-    assert told["components"] == [1] and told["means"] == [[[pytest.approx(0.9), 0.5]]]
+    assert told["components"] == 1 and told["means"] == [[pytest.approx(0.9), 0.5]]
     assert sum(told["histogram"]) == 5000
     step(curriculum, task, 1)
     assert sum(curriculum.log()["histogram"]) == 5000
 
 
 def test_performance_is_that_before_the_update_and_counted() -> None:
-    task = Scripted(torch.rand(2, 8), batch_size=16)
+    task = Scripted(torch.rand(8), batch_size=16)
     curriculum = small(task, source="exact")
-    streams = [Streams(0), Streams(1)]
-    batch = curriculum.propose(task, 16, streams)
+    batch = curriculum.propose(task, 16, Streams(0))
     assert task.evaluations == 16
-    expected = task.skills.gather(1, batch.levels)
-    task.skills = torch.rand(2, 8)
-    curriculum.observe(task, batch, reached(torch.rand(2, 16)))
+    expected = task.skills[batch.levels]
+    task.skills = torch.rand(8)
+    curriculum.observe(task, batch, reached(torch.rand(16)))
     curriculum.log()
     history = curriculum.state_dict()["history"]
     torch.testing.assert_close(history["returns"], expected.double())
-    small(task).propose(task, 16, streams)
+    small(task).propose(task, 16, Streams(0))
     assert task.evaluations == 16
 
 
 def test_without_scikit_learn_a_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("proposer_rl.curricula.gaussian_mixtures.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"install it with: .*\[alp-gmm\]'?$"):
-        small(Scripted(torch.zeros(1, 3)))
+        small(Scripted(torch.zeros(3)))

@@ -51,7 +51,8 @@ def test_nobody_asks_the_task_how_well_the_student_does(
     monkeypatch.setattr(MazeTask, "performance", counted)
     experiment.run()
     assert not asked
-    assert (experiment.student.evaluations, experiment.student.frames) == (0, 0)
+    (student,) = experiment.sides.students
+    assert (student.evaluations, student.frames) == (0, 0)
 
 
 def scripted_filter(student: Scripted, **numbers: Any) -> Modelled:
@@ -67,13 +68,13 @@ def scripted_filter(student: Scripted, **numbers: Any) -> Modelled:
 def test_it_finds_what_is_neither_mastered_nor_out_of_reach() -> None:
     """Of nine bins the middle one is solved now and then; it soon is what is trained on."""
     torch.manual_seed(0)
-    skills = torch.tensor([[0.0, 0, 0, 0, 0.5, 1, 1, 1, 1]])
+    skills = torch.tensor([0.0, 0, 0, 0, 0.5, 1, 1, 1, 1])
     student = Scripted(skills)
     curriculum, shares = scripted_filter(student), []
     for update in range(12):
-        streams = [Streams(0, "update", update)]
+        streams = Streams(0, "update", update)
         batch = curriculum.propose(student, 32, streams)
-        outcome = reached((torch.rand(1, 32) < skills.gather(1, batch.levels)).float())
+        outcome = reached((torch.rand(32) < skills[batch.levels]).float())
         curriculum.observe(student, batch, outcome)
         shares.append(float((batch.levels == 4).float().mean()))
     assert shares[0] < 0.3 < 0.6 < shares[-1]
@@ -82,17 +83,17 @@ def test_it_finds_what_is_neither_mastered_nor_out_of_reach() -> None:
 
 def test_it_tells_how_right_it_was() -> None:
     """The Brier score of what it said before, against that of the share of successes."""
-    student = Scripted(torch.tensor([[0.0, 0.0, 0.0, 1.0]]))
+    student = Scripted(torch.tensor([0.0, 0.0, 0.0, 1.0]))
     curriculum = scripted_filter(student)
     step(curriculum, student, 0)
     first = curriculum.log()
-    assert first["brier"] == [0.25]  # one half of everything
-    assert first["reliability"]["levels"][0] == [0, 0, 0, 0, 0, 32, 0, 0, 0, 0]
+    assert first["brier"] == 0.25  # one half of everything
+    assert first["reliability"]["levels"] == [0, 0, 0, 0, 0, 32, 0, 0, 0, 0]
     for update in range(1, 9):
         step(curriculum, student, update)
     told = curriculum.log()
-    assert told["brier"][0] < 0.1 * told["brier_constant"][0]
-    levels, said, was = (torch.tensor(told["reliability"][k][0]) for k in told["reliability"])
+    assert told["brier"] < 0.1 * told["brier_constant"]
+    levels, said, was = (torch.tensor(told["reliability"][k]) for k in told["reliability"])
     assert levels.sum() == 8 * 32
     assert ((said - was).abs() * levels).sum() / levels.sum() < 0.1
     assert curriculum.log() == {}
@@ -100,11 +101,11 @@ def test_it_tells_how_right_it_was() -> None:
 
 def test_whole_batches_are_taken_in_one_by_one() -> None:
     """As by the model itself, also where the log is read in between."""
-    student = Scripted(torch.tensor([[0.0, 0.3, 0.7, 1.0]]))
+    student = Scripted(torch.tensor([0.0, 0.3, 0.7, 1.0]))
     curriculum, model = scripted_filter(student), OutcomeModel(labels="above_worst")
     for update in range(5):
-        batch = curriculum.propose(student, 16, [Streams(0, "update", update)])
-        outcome = reached(torch.rand(1, 16, generator=torch.Generator().manual_seed(update)))
+        batch = curriculum.propose(student, 16, Streams(0, "update", update))
+        outcome = reached(torch.rand(16, generator=torch.Generator().manual_seed(update)))
         curriculum.observe(student, batch, outcome)
         told = {name: outcome[name].double() for name in ("return", "success")}
         model.add(space_features(student.space, batch.levels).double(), told)
@@ -116,20 +117,20 @@ def test_whole_batches_are_taken_in_one_by_one() -> None:
 
 def test_success_that_is_not_needed_may_be_told_of_some_levels_alone() -> None:
     """In parts of a batch, and in some batches: it makes no difference."""
-    skills = torch.tensor([[0.0, 0.2, 0.8, 1.0]])
+    skills = torch.tensor([0.0, 0.2, 0.8, 1.0])
     predicted = []
     for told in (True, False):
         student = Scripted(skills)
         curriculum = scripted_filter(student)
         for update in range(3):
-            batch = curriculum.propose(student, 8, [Streams(0, update)])
-            outcome = reached(skills.gather(1, batch.levels))
+            batch = curriculum.propose(student, 8, Streams(0, update))
+            outcome = reached(skills[batch.levels])
             for part in (slice(0, 4), slice(4, 8)):
-                some = outcome[:, part]
+                some = outcome[part]
                 if not told or update == 1 or part.start:
                     some = some.exclude("success")
-                curriculum.observe(student, batch[:, part], some)
-        predicted.append(curriculum.propose(student, 8, [Streams(0)]).notes["predicted"])
+                curriculum.observe(student, batch[part], some)
+        predicted.append(curriculum.propose(student, 8, Streams(0)).notes["predicted"])
     assert predicted[0].equal(predicted[1])
 
 
@@ -138,7 +139,7 @@ def test_features_that_are_not_finite_are_refused() -> None:
     features = lambda levels: levels.unsqueeze(-1) / 0  # noqa: E731
     curriculum = Modelled(SamplingCurriculum(uniform), features)
     with pytest.raises(ValueError, match="features: 3 of 3 numbers are not finite"):
-        curriculum.propose(Student(), 3, [Streams(0)])
+        curriculum.propose(Student(), 3, Streams(0))
 
 
 SPACES = {

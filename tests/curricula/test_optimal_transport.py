@@ -94,26 +94,25 @@ def curriculum(task: Any, **options: Any) -> TransportCurriculum:
 
 
 def test_a_long_reach_and_nothing_to_master_give_the_target_at_once() -> None:
-    task = Scripted(torch.zeros(1, 5), batch_size=10)
+    task = Scripted(torch.zeros(5), batch_size=10)
     task.target_shares = torch.tensor([0.0, 0.3, 0.0, 0.0, 0.7])
     found = curriculum(task, delta=0.0, epsilon=5.0)
-    assert step(found, task, 0)[0].bincount(minlength=5).tolist() == [0, 3, 0, 0, 7]
+    assert step(found, task, 0).bincount(minlength=5).tolist() == [0, 3, 0, 0, 7]
 
 
 def test_a_master_is_led_to_the_target_step_by_step() -> None:
-    task = Scripted(torch.ones(1, 5))
+    task = Scripted(torch.ones(5))
     found = curriculum(task, epsilon=0.3)
     places = task.space.coordinates[:, 0].double().numpy()
     before, distances = np.full(5, 0.2), []
     for update in range(12):
         step(found, task, update)
-        now = found.shares()[0].numpy()
+        now = found.shares().numpy()
         assert squared(now, before, places) <= 0.3**2 + 1e-6
         told = found.log()
-        assert told["target_distance"] == [
-            pytest.approx(squared(now, np.eye(5)[4], places) ** 0.5, abs=1e-6)
-        ]
-        distances += told["target_distance"]
+        expected = squared(now, np.eye(5)[4], places) ** 0.5
+        assert told["target_distance"] == pytest.approx(expected, abs=1e-6)
+        distances.append(told["target_distance"])
         before = now
     assert distances == sorted(distances, reverse=True)
     assert distances[3] > 0.1 and distances[-1] == pytest.approx(0, abs=1e-5)
@@ -121,35 +120,40 @@ def test_a_master_is_led_to_the_target_step_by_step() -> None:
 
 
 def test_only_bins_that_are_mastered_are_drawn_from_and_the_way_opens_with_them() -> None:
-    task = Scripted(torch.tensor([[0.9, 0.6, 0.2, 0.1, 0.0], [0.0, 0.1, 0.3, 0.2, 0.0]]))
+    task = Scripted(torch.tensor([0.9, 0.6, 0.2, 0.1, 0.0]))
     found = curriculum(task, delta=0.5, epsilon=0.4)
     for update in range(8):
         bins = step(found, task, update)
-        assert (bins[0] <= 1).all()
-        assert (bins[1] == 2).all()  # nothing is mastered: where it is best
-    assert (bins[0] == 1).all()  # the nearest to the target
-    task.skills[0, 2:4] = 0.7
+        assert (bins <= 1).all()
+    assert (bins == 1).all()  # the nearest to the target
+    task.skills[2:4] = 0.7
     for update in range(8, 16):
         bins = step(found, task, update)
-    assert (bins[0] == 3).all()
-    assert found.log()["allowed_bins"] == [4, 1]
+    assert (bins == 3).all()
+    assert found.log()["allowed_bins"] == 4
+
+
+def test_where_nothing_is_mastered_the_best_bin_is_drawn_from() -> None:
+    task = Scripted(torch.tensor([0.0, 0.1, 0.3, 0.2, 0.0]))
+    found = curriculum(task, delta=0.5, epsilon=0.4)
+    assert (step(found, task, 0) == 2).all() and found.log()["allowed_bins"] == 1
 
 
 def test_where_all_fails_all_is_searched() -> None:
-    task = Scripted(torch.zeros(1, 5), batch_size=10)
+    task = Scripted(torch.zeros(5), batch_size=10)
     found = curriculum(task, delta=0.5, epsilon=0.01)
-    assert step(found, task, 0)[0].bincount(minlength=5).tolist() == [2] * 5
+    assert step(found, task, 0).bincount(minlength=5).tolist() == [2] * 5
 
 
 def test_uniform_draws_end_where_the_target_is_reached() -> None:
-    task = Scripted(torch.tensor([[0.9, 0.6, 0.2, 0.1, 0.0]]), batch_size=100)
+    task = Scripted(torch.tensor([0.9, 0.6, 0.2, 0.1, 0.0]), batch_size=100)
     task.target_shares = torch.tensor([0.0, 0.0, 0.0, 0.75, 0.25])
     found = curriculum(task, delta=0.5, epsilon=5.0, exploration=0.5)
     # None of the target, three quarters of it, and all.
     for skills, uniform in ([0.1, 0.0], 50), ([0.5, 0.0], 12.5), ([0.7, 0.5], 0):
-        task.skills[0, 3:] = torch.tensor(skills)
-        counts = step(found, task, 0)[0].bincount(minlength=5)
-        below = counts[task.skills[0] < 0.5].tolist()
+        task.skills[3:] = torch.tensor(skills)
+        counts = step(found, task, 0).bincount(minlength=5)
+        below = counts[task.skills < 0.5].tolist()
         assert below == [pytest.approx(uniform / 5, abs=1)] * len(below)
     assert counts.tolist() == [0, 0, 0, 75, 25]
 

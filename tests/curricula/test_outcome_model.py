@@ -150,7 +150,7 @@ def test_on_mazes_it_ranks_levels_by_their_exact_success_the_better_the_more_it_
     model, ranks, squares = OutcomeModel(half_life=1e3), [], []
     for batch in range(80):
         levels = TASK.space.sample(p, Streams(0, batch).generator())[None]
-        rollout = solver.play(levels, [Streams(1, batch).generator()])
+        rollout = solver.play(levels, Streams(1, batch).generator())
         reached = outcome_of(rollout).select("return", "success").double()
         model.add(TASK.features(levels), dict(reached.items()))
         if batch in (0, 79):

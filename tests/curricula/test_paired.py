@@ -21,7 +21,7 @@ P, T = 4, 8
 
 def test_equal_students_have_no_regret() -> None:
     curriculum = paired(Streams(0, "solver"))  # the protagonist's own
-    levels = TASK.space.sample(P, torch.Generator().manual_seed(0)).unsqueeze(0)
+    levels = TASK.space.sample(P, torch.Generator().manual_seed(0))
     regret, metrics = curriculum.reward(student(0), levels, Streams(0))
     assert (regret == 0).all() and metrics["regret"] == 0
 
@@ -31,12 +31,12 @@ def test_the_reward_is_what_the_antagonist_gets_more(times: int) -> None:
     curriculum, learner = paired(), solvers([0])
     antagonist = TASK.learner([Streams(0, "antagonist")]).agent
     levels = TASK.space.sample(P, torch.Generator().manual_seed(2))
-    regret, _ = curriculum.reward(student(0), levels.unsqueeze(0), Streams(0))
+    regret, _ = curriculum.reward(student(0), levels, Streams(0))
     other, own = (evaluate(agent, levels)["return"][0] for agent in (antagonist, learner.agent))
-    torch.testing.assert_close(regret[0], (other - own).clamp_min(0))
+    torch.testing.assert_close(regret, (other - own).clamp_min(0))
     assert float(regret.max()) > 0
     whole = curriculum if times == 1 else filtered(curriculum, times=times)
-    lived = live(whole, learner, [0], range(4))
+    (lived,) = live([whole], learner, [0], range(4))
     # Both students on all that is drawn; the antagonist trains on what the protagonist trained on.
     assert lived.frames == [P * T] * 4
     assert lived.evaluations == [2 * times * P + (times > 1) * times * P] * 4
@@ -46,12 +46,11 @@ def test_the_reward_is_what_the_antagonist_gets_more(times: int) -> None:
 def test_the_antagonist_trains_on_the_same_levels_with_its_own_chance() -> None:
     curriculum, learner = paired(), solvers([0])
     plain = TASK.learner([Streams(0, "antagonist")])
-    lived = live(curriculum, learner, [0], range(2))
-    curriculum.log()
+    (lived,) = live([curriculum], learner, [0], range(2))
     for number, levels in enumerate(lived.levels):
-        plain.env.set_levels(levels)
+        plain.env.set_levels(levels.unsqueeze(0))
         plain.update([Streams(0, "update", number).generator("antagonist")])
-    assert (plain.snapshot() == curriculum.antagonist.snapshot()).all()
+    assert (plain.snapshot()[0] == curriculum.antagonist.snapshot()).all()
 
 
 def test_it_has_no_second_solver_whose_episodes_go_on() -> None:

@@ -60,7 +60,7 @@ def rewarded(*parts: Any) -> FirstOrderProposer:
 
 def filtered(curriculum: Curriculum, times: int) -> Curriculum:
     """Trains on one in so many levels: those with the highest scores, which are the last."""
-    scores = GivenScores(torch.arange(float(times * P)).unsqueeze(0))
+    scores = GivenScores(torch.arange(float(times * P)))
     return curriculum if times == 1 else Filtered(curriculum, scores, times=times, temperature=1e-3)
 
 
@@ -95,20 +95,20 @@ def assert_same_weights(found: ActorCritic, expected: ActorCritic) -> None:
 def test_numbers_that_went_wrong_are_told_where_they_arise(
     paid: float, told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    task = Seen(1, WANTED)
+    task = Seen(WANTED)
     curriculum = proposer(task)
-    monkeypatch.setattr(curriculum, "reward", lambda *_: (torch.full((1, P), paid), {}))
+    monkeypatch.setattr(curriculum, "reward", lambda *_: (torch.full((P,), paid), {}))
     with pytest.raises(DivergedError, match=f"^the Proposer: {told}"):
-        curriculum.propose(taught(task), P, [Streams(0, 0)])
+        curriculum.propose(taught(task), P, Streams(0, 0))
 
 
 def test_it_learns_to_choose_what_the_target_needs() -> None:
-    task = Seen(1, WANTED)
+    task = Seen(WANTED)
     curriculum = proposer(task)
     for update in range(60):
         student = taught(task)
-        batch = curriculum.propose(student, P, [Streams(0, update)])
-    assert batch.levels.shape == (1, P)
+        batch = curriculum.propose(student, P, Streams(0, update))
+    assert batch.levels.shape == (P,)
     assert (student.frames, student.evaluations) == (0, 3 + 2 * P)
     assert (batch.levels == 2).float().mean() > 0.8
 
@@ -116,20 +116,20 @@ def test_it_learns_to_choose_what_the_target_needs() -> None:
 @pytest.mark.parametrize("times", [1, 3])
 def test_every_problem_is_credited_with_its_own_alignment(times: int) -> None:
     """Also those that the Solver does not train on."""
-    task = Seen(1, WANTED)
+    task = Seen(WANTED)
     curriculum = proposer(task, epochs=1, entropy_coeff=0.3, max_grad_norm=100.0)
     expected, student = copy.deepcopy(curriculum.agent), taught(task)
-    batch = filtered(curriculum, times).propose(student, P, [Streams(0)])
+    batch = filtered(curriculum, times).propose(student, P, Streams(0))
     assert student.evaluations == 3 + 2 * P * times
     last = step_by_hand(expected, Streams(0), times, slice(None))
-    assert sorted(batch.levels[0].tolist()) == sorted(last.tolist())
+    assert sorted(batch.levels.tolist()) == sorted(last.tolist())
     assert_same_weights(curriculum.agent, expected)
 
 
 def test_all_that_it_computes_with_is_on_the_tasks_device() -> None:
     """The bounds of TorchRL's clipping, and Adam's moments after a checkpoint, read to the CPU."""
-    begun, task = proposer(Seen(1, WANTED)), Seen(1, WANTED)
-    begun.propose(taught(task), P, [Streams(0)])
+    begun, task = proposer(Seen(WANTED)), Seen(WANTED)
+    begun.propose(taught(task), P, Streams(0))
     there = SimpleNamespace(sample=lambda count, generator: torch.full((count,), -1, device="meta"))
     elsewhere = rewarded(task.space, there, agent().to("meta"), PPOSettings())
     elsewhere.load_state_dict(begun.state_dict())
@@ -144,9 +144,9 @@ def test_all_that_it_computes_with_is_on_the_tasks_device() -> None:
 
 
 def test_a_proposer_that_has_not_begun_resumes_too() -> None:
-    task = Seen(1, WANTED)
+    task = Seen(WANTED)
     one, other = proposer(task), proposer(task)
     other.load_state_dict(one.state_dict())
     assert one.log() == {}
-    levels = [c.propose(taught(task), P, [Streams(0)]).levels for c in (one, other)]
+    levels = [c.propose(taught(task), P, Streams(0)).levels for c in (one, other)]
     assert torch.equal(*levels)

@@ -24,13 +24,13 @@ FIRST = ([-0.01, -0.01, 0.99], [0.7, 0.4, 0.9])
 SECOND = ([-0.01, -0.01, 0.99], [0.8, 0.9, 0.6])
 SHORT = ([0.99], [0.5])
 FAILED = ([-0.01] * 3, [0.2] * 3)
-NONE = unseen((1, 1))
+NONE = unseen(1)
 
 Episode = tuple[list[float], list[float]]
 
 
 def played(*parts: Episode, success: bool = True, after: float = 0.0, cut: int = 0) -> TensorDict:
-    """A rollout [1, 1, T] of those episodes.
+    """A rollout [1, T] of those episodes.
 
     Args:
         parts: rewards and values of each.
@@ -45,7 +45,7 @@ def played(*parts: Episode, success: bool = True, after: float = 0.0, cut: int =
     length = len(reward) - cut
 
     def column(values: list[Any]) -> Tensor:
-        return torch.tensor(values[:length]).view(1, 1, length, 1)
+        return torch.tensor(values[:length]).view(1, length, 1)
 
     step = {
         "reward": column(reward),
@@ -53,7 +53,7 @@ def played(*parts: Episode, success: bool = True, after: float = 0.0, cut: int =
         "done": column(ends),
         "terminated": column([end and success for end in ends]),
     }
-    return TensorDict({"state_value": column(value), "next": step}, (1, 1, length))
+    return TensorDict({"state_value": column(value), "next": step}, (1, length))
 
 
 def score(name: str, *rollouts: TensorDict, best: Tensor = NONE) -> float:
@@ -82,7 +82,7 @@ def test_scores_are_those_of_the_table(name: str, rollout: TensorDict, expected:
 
 
 def test_the_best_return_of_a_level_is_remembered() -> None:
-    best = torch.tensor([[0.98]])
+    best = torch.tensor([0.98])
     assert score("max_mc", played(FIRST), best=best) == pytest.approx(0.313333, abs=1e-6)
     assert score("regret", played(FIRST), best=best) == pytest.approx(0.01, abs=1e-6)
     scorer = Scorer("max_mc", "episodes")
@@ -124,7 +124,7 @@ def test_episodes_are_those_of_a_plain_loop(
         start = stop
     after = {"reward": reward, "done": done, "terminated": terminated}
     found = episodes(
-        TensorDict({"next": {k: v.view(1, 1, -1, 1) for k, v in after.items()}}, (1, 1, steps))
+        TensorDict({"next": {k: v.view(1, -1, 1) for k, v in after.items()}}, (1, steps))
     )
     assert int(found.ended) == len(ends)
     assert int(found.successes) == sum(success for _, success in ends)
@@ -133,65 +133,58 @@ def test_episodes_are_those_of_a_plain_loop(
     torch.testing.assert_close(found.weight.flatten().float(), weight)
 
 
-def streams(copies: int) -> list[Streams]:
-    return [Streams(copy) for copy in range(copies)]
-
-
 def test_exact_scores_are_those_of_the_definitions() -> None:
-    learner = learners(2)
-    levels = torch.stack([TASK.space.sample(5, torch.Generator().manual_seed(k)) for k in (0, 1)])
+    """Of either of two Solvers side by side."""
+    learner, levels = learners(2), TASK.space.sample(5, torch.Generator().manual_seed(0))
+    known, best = evaluate(learner.agent, levels), TASK.optimal_return(levels).double()
     for copy in range(2):
-        known = evaluate(learner.agent, levels[copy])
         chance = known["success"][copy].double()
-        best = TASK.optimal_return(levels[copy]).double()
         for name, expected in (
             ("learnability", chance * (1 - chance)),
             ("regret", best - known["return"][copy].double()),
         ):
-            taught = TaskStudent(TASK, learner)
-            found = Scorer(name, "exact")(taught, levels, streams(2))
+            taught = TaskStudent(TASK, learner, copy)
+            found = Scorer(name, "exact")(taught, levels, Streams(0))
             assert taught.evaluations == 5
-            torch.testing.assert_close(found.score[copy], expected, atol=1e-6, rtol=0)
+            torch.testing.assert_close(found.score, expected, atol=1e-6, rtol=0)
 
 
 def test_what_is_played_is_a_share_of_the_episodes_that_ended() -> None:
-    learner = learners(2)
-    levels = torch.stack([TASK.space.sample(8, torch.Generator().manual_seed(k)) for k in (0, 1)])
+    learner, levels = learners(1), TASK.space.sample(8, torch.Generator().manual_seed(0))
     scorer = Scorer("learnability", "episodes", rollouts=3)
     taught = TaskStudent(TASK, learner)
-    found = scorer(taught, levels, streams(2), "why")
+    found = scorer(taught, levels, Streams(0), "why")
     assert taught.frames == 3 * 8 * 8
     for batch in range(2):
-        some = levels[:, 4 * batch : 4 * batch + 4]
-        won, ended = torch.zeros(2, 2, 4)
+        some = slice(4 * batch, 4 * batch + 4)
+        won, ended = torch.zeros(2, 4)
         for again in range(3):
-            learner.env.set_levels(some)
-            draws = [s.generator("score", "why", batch, again) for s in streams(2)]
-            after = learner.collect(draws)["next"]
+            learner.env.set_levels(levels[some].unsqueeze(0))
+            draws = Streams(0).generator("score", "why", batch, again)
+            after = learner.collect([draws])["next"][0]
             won += after["terminated"].sum((-2, -1))
             ended += after["done"].sum((-2, -1))
         share = (won / ended).double()
-        here = found.score[:, 4 * batch : 4 * batch + 4]
-        torch.testing.assert_close(here, share * (1 - share), atol=1e-6, rtol=0)
+        torch.testing.assert_close(found.score[some], share * (1 - share), atol=1e-6, rtol=0)
 
 
 def one_step(reached: Tensor, success: Tensor, value: Tensor) -> TensorDict:
-    """A rollout [1, n, 1] of an episode on each level, all [1, n]."""
+    """A rollout [n, 1] of an episode on each level, all [n]."""
     done = torch.ones(*reached.shape, 1, 1, dtype=torch.bool)
     after = {"done": done, "terminated": done, "success": success.view_as(done)}
     after |= {"reward": reached.view(done.shape), "state_value": torch.zeros(done.shape)}
     return TensorDict(
         {"state_value": value.view(done.shape), "next": after},
         [*reached.shape, 1],
-        names=[None, None, "time"],
+        names=[None, "time"],
     )
 
 
 def test_without_a_rollout_an_episode_is_a_step_and_the_last_return_the_critic() -> None:
     """As of a rollout of one step, whose value is the return before."""
-    reached, value = torch.tensor([[0.2, 0.9, -1.0]]), torch.tensor([[0.5, 0.3, -torch.inf]])
-    best = torch.tensor([[0.5, 0.7, -torch.inf]])
-    outcome = TensorDict({"return": reached, "success": (reached > 0).float()}, [1, 3])
+    reached, value = torch.tensor([0.2, 0.9, -1.0]), torch.tensor([0.5, 0.3, -torch.inf])
+    best = torch.tensor([0.5, 0.7, -torch.inf])
+    outcome = TensorDict({"return": reached, "success": (reached > 0).float()}, [3])
     known = value.where(value.isfinite(), reached)  # at first there is nothing to learn
     rollout = one_step(reached, reached > 0, known)
     for name in (*STEPWISE, "regret"):
@@ -203,44 +196,42 @@ def test_without_a_rollout_an_episode_is_a_step_and_the_last_return_the_critic()
 
 def test_of_outcomes_of_several_plays_the_mean_and_the_highest_count() -> None:
     """As of as many rollouts of one step; value losses are those of the mean return."""
-    g, shape = torch.Generator().manual_seed(0), (1, 5)
-    plays = [torch.rand(shape, generator=g) for _ in range(4)]
-    before, mean = torch.rand(shape, generator=g), torch.stack(plays).mean(0)
+    g = torch.Generator().manual_seed(0)
+    plays = [torch.rand(5, generator=g) for _ in range(4)]
+    before, mean = torch.rand(5, generator=g), torch.stack(plays).mean(0)
 
-    def play(places: Tensor, generators: Any) -> TensorDict:
-        reached = next(left).gather(1, places)
+    def play(places: Tensor, generator: Any) -> TensorDict:
+        reached = next(left)[places]
         ones = torch.ones(places.shape, dtype=torch.int64)
         told = {"return": reached, "success": (reached > 0.5).float()}
         return TensorDict({**told, "episodes": ones, "steps": ones}, places.shape)
 
-    levels, student = torch.arange(5)[None], Student(play=play, batch_size=3)
+    levels, student = torch.arange(5), Student(play=play, batch_size=3)
     for name in (*STEPWISE, "regret", "learnability"):
         of_the_mean = name in STEPWISE.keys() - {"max_mc"}
         rollouts = [one_step(r, r > 0.5, before) for r in ([mean] if of_the_mean else plays)]
         left = iter(plays * 2)  # for the first three levels, and for the others
         scorer = Scorer(name, "episodes", rollouts=4)
-        found = scorer(student, levels, [Streams(0)], before=before)
-        expected = scorer.of_rollouts(LEARNER, rollouts, unseen(shape))
+        found = scorer(student, levels, Streams(0), before=before)
+        expected = scorer.of_rollouts(LEARNER, rollouts, unseen(5))
         torch.testing.assert_close(found.score, expected.score, msg=name)
         torch.testing.assert_close(found.best, torch.stack(plays).amax(0))
 
 
 def test_learnability_is_of_the_share_that_a_loop_tells_and_scores_are_its_own() -> None:
-    outcome = TensorDict(
-        {"return": torch.tensor([[0.2]]), "success": torch.tensor([[0.25]])}, [1, 1]
-    )
-    known = torch.tensor([[0.5]]), torch.tensor([[0.5]])
+    outcome = TensorDict({"return": torch.tensor([0.2]), "success": torch.tensor([0.25])}, [1])
+    known = torch.tensor([0.5]), torch.tensor([0.5])
     found = Scorer("learnability", "episodes").of_outcome(LEARNER, outcome, *known)
     assert float(found.score) == pytest.approx(0.1875)
     assert float(found.best) == 0.5
-    outcome["score"] = torch.tensor([[7.0]])
+    outcome["score"] = torch.tensor([7.0])
     assert float(Scorer("max_mc", "episodes").of_outcome(LEARNER, outcome, *known).score) == 7
 
 
 def test_learnability_needs_a_task_that_tells_success() -> None:
-    blind = Scripted(torch.rand(1, 3), told="return")
+    blind = Scripted(torch.rand(3), told="return")
     with pytest.raises(NoSuccessError, match="this task tells no success, only the return") as no:
-        Scorer("learnability", "exact")(blind, torch.tensor([[0, 1]]), [Streams(0)])
+        Scorer("learnability", "exact")(blind, torch.tensor([0, 1]), Streams(0))
     assert no.value.exit_code == 2
 
 
@@ -257,15 +248,15 @@ def test_a_score_of_ones_own_is_what_its_function_says_of_the_outcome(own: Any) 
     scorer, known = Scorer(own, "episodes", rollouts=2), (NONE, NONE)
     outcome = outcome_of(played(FIRST))
     assert float(scorer.of_outcome(LEARNER, outcome, *known).score) == pytest.approx(0.03)
-    told = TensorDict({"return": torch.tensor([[0.25]])}, [1, 1])  # by a loop that plays itself
+    told = TensorDict({"return": torch.tensor([0.25])}, [1])  # by a loop that plays itself
     assert float(scorer.of_outcome(LEARNER, told, *known).score) == 0.75
     unfinished = outcome_of(played(FIRST, cut=1))
     assert float(scorer.of_outcome(LEARNER, unfinished, *known).score) == -torch.inf
-    told["score"] = torch.tensor([[7.0]])
+    told["score"] = torch.tensor([7.0])
     assert float(scorer.of_outcome(LEARNER, told, *known).score) == 7
 
     rollouts = iter([played(FIRST), played(SHORT)])  # what is only played is scored by the mean
-    found = scorer(Student(play=lambda *_: next(rollouts)), torch.zeros(1, 1), [Streams(0)])
+    found = scorer(Student(play=lambda *_: next(rollouts)), torch.zeros(1), Streams(0))
     assert float(found.score) == pytest.approx((0.03 + 0.01) / 2)
     assert float(found.best) == pytest.approx(0.99)
 
@@ -287,8 +278,8 @@ def test_what_is_no_score_is_refused(score: Any, source: Any, message: str) -> N
 
 
 @pytest.mark.parametrize(
-    "wrong", [lambda *_: torch.ones(3), lambda *_: 1.0, lambda *_: torch.full((1, 1), torch.nan)]
+    "wrong", [lambda *_: torch.ones(3), lambda *_: 1.0, lambda *_: torch.full((1,), torch.nan)]
 )
 def test_what_is_no_number_for_each_level_is_refused(wrong: Any) -> None:
-    with pytest.raises(ValueError, match=r"must return a tensor \[1, 1\] without NaN"):
+    with pytest.raises(ValueError, match=r"must return a tensor \[1\] without NaN"):
         Scorer(wrong, "episodes").of_outcome(LEARNER, outcome_of(played(FIRST)), NONE, NONE)
