@@ -320,7 +320,7 @@ def test_a_signal_within_an_improvement_undoes_what_was_begun(
         assert latest is not None
         state = latest[1]
         assert (state["updates"], state["cycles"]) == (2, 1)
-        assert state["curriculum"]["begun"] == 1
+        assert state["curricula"][0]["begun"] == 1
         experiment(tmp_path / "run", 0, curriculum=Stopped(None)).run()
     assert_same_run(tmp_path / "whole", tmp_path / "run")
 

@@ -46,9 +46,9 @@ def first_cycle(*overrides: str) -> str:
     task, learner, (curriculum,) = parts(config, StopSignals())
     student = TaskStudent(task, learner)
     assert isinstance(curriculum, ProposerCurriculum) and curriculum.trainer is not None
-    metrics = curriculum.improve(student, [Streams(0, "cycle", 0)])
+    metrics = curriculum.improve(student, Streams(0, "cycle", 0))
     levels = [
-        curriculum.propose(student, 4, [Streams(0, "update", update)]).levels.to_text()
+        curriculum.propose(student, 4, Streams(0, "update", update)).to_text()
         for update in range(2)
     ]
     learnt: list[Any] = [
@@ -150,6 +150,6 @@ def test_what_is_exact_has_a_sampled_twin(method: str) -> None:
         config = composed(f"+method={method}", "+scale=smoke", *LITTLE, *options)
         task, learner, (curriculum,) = parts(config, StopSignals())
         student = TaskStudent(task, learner)
-        curriculum.propose(student, task.batch_size, [Streams(0, "update", 0)])
+        curriculum.propose(student, task.batch_size, Streams(0, "update", 0))
         costs[options] = (student.frames > 0, student.evaluations > 0)
     assert costs == {(): (False, True), ("+score=sampled",): (True, False)}

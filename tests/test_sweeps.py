@@ -87,10 +87,6 @@ def test_seeds_side_by_side_give_what_they_give_alone(train) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["+method=perf_gain", "seeds=[0,1]"],
-            "seeds=[0, 1]: a Proposer proposes to one Solver at a time",
-        ),
         (["+method=target", "seeds=[1,1]"], "seeds=[1, 1]: must be distinct"),
         (["+method=target", "seeds=[]"], "seeds=[]: list should have at least 1 item"),
     ],

@@ -132,14 +132,14 @@ def test_only_training_moves_the_moments(trained: Any) -> None:
     """Evaluations, probes, gradients and what others watch read them as they are."""
     task, learner, _ = trained
     before = learner.snapshot()
-    student = TaskStudent(task, learner)
-    levels = torch.stack([task.evaluated_on["target"][:2]] * K)
+    students = [TaskStudent(task, learner, k) for k in range(K)]
+    levels = task.evaluated_on["target"][:2]
     task.measure(learner.agent)
-    rollout = student.play(levels, generators(*range(K)))
-    probes = student.probe(levels[0])
+    rollouts = [one.play(levels, g) for one, g in zip(students, generators(*range(K)), strict=True)]
+    probes = torch.stack([student.probe(levels) for student in students])
     assert (learner.snapshot() == before).all()
     agent = learner.agent
-    state = rollout[:, :, 0]
+    state: Any = torch.stack(rollouts)[:, :, 0]
     torch.testing.assert_close(probes, agent(state.clone())["logits"].softmax(-1))
     assert "normalization.returns.count" in before.keys()
     # A population that works out gradients of levels is shown what the Solver is.

@@ -217,7 +217,7 @@ def test_the_reader_is_independent_of_training() -> None:
         "loaded = {name.split('.')[0] for name in sys.modules}\n"
         "assert not loaded & {'torch', 'torchrl', 'tensordict', 'hydra'}, loaded\n"
         "rooms = {name.split('.')[1] for name in sys.modules if name.startswith('proposer_rl.')}\n"
-        "assert rooms == {'cli', 'recipes', 'report', 'runs'}, rooms\n"
+        "assert rooms == {'cli', 'extras', 'recipes', 'report', 'runs'}, rooms\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 

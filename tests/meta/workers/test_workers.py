@@ -102,7 +102,7 @@ def diverges(task: Any, curriculum: Any) -> None:
     next(iter(broken.values()))["value"].fill_(torch.nan)
     solver.restore(broken)
     with pytest.raises(DivergedError, match="update 0 of the episode of the So"):
-        curriculum.improve(TaskStudent(task, solver), [Streams(0, "cycle", 0)])
+        curriculum.improve(TaskStudent(task, solver), Streams(0, "cycle", 0))
 
 
 def test_workers_that_are_lost_again_and_again_stop_the_run(monkeypatch) -> None:
@@ -123,7 +123,7 @@ def test_workers_that_are_lost_again_and_again_stop_the_run(monkeypatch) -> None
             WorkersError, match="workers=2: were lost 3 times in one cycle, last: it fell off; the"
         ),
     ):
-        curriculum.improve(TaskStudent(task, solver), [Streams(0, "cycle", 0)])
+        curriculum.improve(TaskStudent(task, solver), Streams(0, "cycle", 0))
     # Between two attempts a signal that has come with the loss is acted on.
     assert (len(started), checked) == (3, [0, 0])
 
