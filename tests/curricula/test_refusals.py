@@ -106,7 +106,13 @@ def test_a_mixture_is_not_filtered() -> None:
 def test_what_bins_cost_or_lack_is_told_first() -> None:
     one, many = (ParameterSpace({"x": intervals(0.0, 1.0, count)}) for count in (1, 5000))
     draws = partial(  # and PAIRED's generator, its twin
-        FirstOrderProposer, target=TARGET, agent=problem_agent(), settings=SETTINGS, target_levels=3
+        FirstOrderProposer,
+        target=TARGET,
+        agent=problem_agent(),
+        settings=SETTINGS,
+        target_levels=3,
+        step=1.0,
+        measure="return",
     )
     seeds, rounded = ParameterSpace({}), partial(MixtureCurriculum, refit=64, warmup=64)
     makers: list[Callable[..., Any]] = [LearningProgressCurriculum, Mixture, draws]
