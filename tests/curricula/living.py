@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, outcome_of
 from proposer_rl.learning import PPO, PPOSettings, SolverSettings, Update
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.mazes.maze_settings import UNetSettings
+from proposer_rl.tasks.mazes.task import UNetSettings
 from tests.tiny import tiny_task
 
 # What holds of a curriculum does not hang on how much a Solver makes of its levels.

@@ -140,16 +140,7 @@ class BatchedEnv(EnvBase):
         return next(iter(level.values())).unsqueeze(-1)[..., :0]
 
     def set_levels(self, levels: TensorDictBase) -> None:
-        """Sets levels [*B], each of which is played from its own next reset on.
-
-        Raises:
-            ValueError: if they are of another batch shape.
-        """
-        if levels.batch_size != self.batch_size:
-            raise ValueError(
-                f"levels must keep the environment's batch shape {list(self.batch_size)}, "
-                f"got {list(levels.batch_size)}"
-            )
+        """Sets levels [*B], each of which is played from its own next reset on."""
         for name, place in self._next.items():
             place.copy_(levels[name])
 

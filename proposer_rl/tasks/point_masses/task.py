@@ -135,8 +135,7 @@ class PointMassTask(BatchedTask):
         parameters: what differs between levels.
 
     Raises:
-        ValueError: naming the key, for a parameter that is no range, or below zero where it cannot
-            be.
+        ValueError: naming the key, for a parameter that is no range.
     """
 
     title, noun, seeded = "point mass", "gates", False
@@ -161,10 +160,6 @@ class PointMassTask(BatchedTask):
             solver=solver,
             context=context,
         )
-        for name in ("width", "friction"):
-            for bins in (self.space.bins[name], self.target.bins[name]):
-                if bins.low[0] < 0:
-                    raise ValueError(f"parameters.{name}: {bins:} goes below zero")
 
     def pictures(
         self, levels: TensorDictBase, rollout: TensorDictBase | None

@@ -145,8 +145,6 @@ def test_levels_are_its_own() -> None:
     env = StillEnv(levels)
     levels["first"].fill_(9)
     assert env.reset()["observation"].flatten().tolist() == [1, 2]
-    with pytest.raises(ValueError, match=r"keep the environment's batch shape \[2\], got \[3\]"):
-        env.set_levels(firsts(1, 2, 3))
 
 
 class Pushed(nn.Module):
