@@ -133,14 +133,14 @@ def python(
 
 def serve() -> None:
     gc.disable()  # of what is imported nothing is garbage
-    from proposer_rl.cli import run, shown, train  # noqa: F401  run takes seconds
+    from proposer_rl.cli import run, train, watch  # noqa: F401  run takes seconds
     from tests import composing
 
     # What takes seconds, before the first fork. tensordict loads pandas where there is one.
     for module in ("proposer_rl.tasks.mazes.task", "pandas"):
         import_module(module)
     composing.remember()
-    shown.draw_run = lambda folder, title: folder / "run.png"  # a quarter of what a child computes
+    watch.draw_run = lambda folder, title: folder / "run.png"  # a quarter of what a child computes
     gc.freeze()  # a child that looks for garbage would copy all that memory
     gc.enable()
 

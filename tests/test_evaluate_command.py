@@ -12,8 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from proposer_rl.cli.eval import main
-from proposer_rl.cli.evaluate import SHOWN, Evaluation, _print
+from proposer_rl.cli.eval import SHOWN, Evaluation, _print, main
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.task import LevelResult

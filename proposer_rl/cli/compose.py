@@ -23,7 +23,7 @@ from proposer_rl.cli.config import RunConfig, read_config
 from proposer_rl.cli.errors import ConfigError
 from proposer_rl.cli.groups import Invocation, arranged, check_groups, explained, invocation
 from proposer_rl.cli.run import carry_out
-from proposer_rl.cli.shown import show_run
+from proposer_rl.cli.watch import show_run
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.folder import storage
 from proposer_rl.runs.process import StopSignals

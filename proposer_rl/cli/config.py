@@ -22,12 +22,11 @@ from proposer_rl.experiment import ScheduleSettings
 from proposer_rl.extras import where_to_look
 from proposer_rl.learning import SolverSettings
 from proposer_rl.meta.assembly import ProposerSettings
-from proposer_rl.runs.folder import read_bounded
+from proposer_rl.runs.folder import storage
 from proposer_rl.settings import ArgumentError, arguments, settings
 
 # No number in use comes near; beyond it are typing errors, and what machine integers cannot hold.
 LARGEST = 10**9
-LARGEST_FILE = 10**6
 # What a task's maker is given beside the task's own settings.
 GIVEN_TO_TASKS = ("solver", "context")
 # Bad input, and what is said of annotations that name nothing.
@@ -232,9 +231,10 @@ def checked_config(values: Mapping[str, Any], file: Path) -> RunConfig:
 def stored_config(file: Path) -> Any:
     """Returns the content of a run's ``config.json`` unchecked."""
     try:
-        return json.loads(read_bounded(file, LARGEST_FILE))
+        with storage(file, "read"):
+            return json.loads(file.read_bytes())
     except (ValueError, RecursionError):
-        raise ConfigError(f"{file}: is no JSON of at most {LARGEST_FILE:,} bytes") from None
+        raise ConfigError(f"{file}: is no JSON") from None
 
 
 def _resolved(config: DictConfig) -> Any:
