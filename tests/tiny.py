@@ -30,7 +30,7 @@ from proposer_rl.tasks.mazes.task import (
     SpaceSettings,
     UNetSettings,
 )
-from proposer_rl.tasks.point_masses.task import GateSettings, PointMassTask
+from proposer_rl.tasks.point_masses import GateSettings, PointMassTask
 from proposer_rl.tasks.ranges import RangeSettings
 from proposer_rl.tasks.view_mazes.task import ViewEvaluationSettings, ViewMazeSettings, ViewMazeTask
 from proposer_rl.tasks.view_mazes.view_env import ViewNetworkSettings

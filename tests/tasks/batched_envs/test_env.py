@@ -9,7 +9,7 @@ from torch import nn
 from torchrl.envs import check_env_specs
 
 from proposer_rl.models import population
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, finalized, uniform
+from proposer_rl.tasks.batched_envs import BatchedEnv, finalized, uniform
 from tests.host_reads import NoHostReads
 from tests.tasks.batched_envs.toys import StillEnv, WindyEnv
 
