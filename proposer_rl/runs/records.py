@@ -117,14 +117,6 @@ def anywhere(text: str) -> str:
     return re.sub(r"(?<![\w./])/(?:[\w.\-]+/)+", "", text)
 
 
-def picture(encoded: str | None) -> NDArray[np.uint8] | None:
-    """Returns a recorded picture, uint8 [H, W, 3]; None where there is none or it is damaged."""
-    try:
-        return None if encoded is None else pixels(encoded)
-    except (ValueError, OSError, SyntaxError):  # of base64, PIL and its PNG decoder
-        return None
-
-
 def number(value: Any) -> float:
     """Returns a recorded number, of a list of numbers the mean; NaN where it is neither."""
     if isinstance(value, list):
