@@ -22,14 +22,14 @@ from proposer_rl import (
 from proposer_rl.learning import LearningSettings
 from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.runs.folder import RunFolder, read_csv
-from proposer_rl.tasks.mazes.maze_settings import (
+from proposer_rl.tasks.mazes.task import (
     DistributionSettings,
     MazeEvaluationSettings,
     MazeSettings,
+    MazeTask,
     SpaceSettings,
     UNetSettings,
 )
-from proposer_rl.tasks.mazes.task import MazeTask
 
 CYCLE = 10  # updates between two improvements of a curriculum
 

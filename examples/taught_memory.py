@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 import proposer_rl as prl
 from proposer_rl.tasks.mazes.generation import edit_levels
-from proposer_rl.tasks.view_mazes.view_distributions import scattered_walls
 from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv
+from proposer_rl.tasks.view_mazes.view_levels import scattered_walls
 
 MAZES, STEPS = 32, 24
 

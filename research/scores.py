@@ -21,7 +21,7 @@ from rich.text import Text
 from tqdm import tqdm
 
 from proposer_rl.cli.errors import ConfigError, check_file, command
-from proposer_rl.cli.evaluate import Evaluation, evaluate, load
+from proposer_rl.cli.eval import Evaluation, evaluate, load
 from proposer_rl.report.reading import find_runs
 from proposer_rl.report.runs import Run
 from proposer_rl.report.studies import read_studies

@@ -85,10 +85,10 @@ def _seeded() -> None:
 @pytest.fixture(autouse=True)
 def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """The picture at the end of a run takes a third of a smoke run, and few tests look at it."""
-    from proposer_rl.cli import shown
+    from proposer_rl.cli import watch
 
     if request.node.get_closest_marker("pictures") is None:
-        monkeypatch.setattr(shown, "draw_run", _draw_nothing)
+        monkeypatch.setattr(watch, "draw_run", _draw_nothing)
 
 
 def _draw_nothing(folder: Path, title: str) -> Path:

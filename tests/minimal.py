@@ -208,11 +208,11 @@ def _undrawn(folder: Path, title: str) -> Path:
 
 
 def _run(extra: str) -> None:
-    from proposer_rl.cli import shown
+    from proposer_rl.cli import watch
 
     scripts = {script.name: script for script in metadata.entry_points(group="console_scripts")}
     if extra not in ("", "tensorboard"):  # which logs it
-        shown.draw_run = _undrawn
+        watch.draw_run = _undrawn
     for name, *arguments in commands(extra):
         command = scripts[f"proposer-{name}"].load()
         if name == "report":
@@ -224,7 +224,7 @@ def _run(extra: str) -> None:
         else:
             _call(command, name, arguments)
         print("DID", name, *arguments, flush=True)
-        shown.draw_run = _undrawn
+        watch.draw_run = _undrawn
     if extra == "":
         import gymnasium
 

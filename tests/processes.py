@@ -65,7 +65,6 @@ class Request:
         terminal: it is a terminal that is closed, which hangs up: SIGHUP.
         ignored: signals that it ignores from the start, as after ``nohup`` or ``disown``.
         folder: where the child works.
-        module: whose ``main`` is called, with the arguments in ``sys.argv``.
     """
 
     arguments: list[str]
@@ -77,7 +76,6 @@ class Request:
     terminal: bool = False
     ignored: list[int] = field(default_factory=list)
     folder: str = "."
-    module: str = "proposer_rl.cli.train"
 
 
 class Processes:
@@ -135,14 +133,14 @@ def python(
 
 def serve() -> None:
     gc.disable()  # of what is imported nothing is garbage
-    from proposer_rl.cli import run, shown, train  # noqa: F401  run takes seconds
+    from proposer_rl.cli import run, train, watch  # noqa: F401  run takes seconds
     from tests import composing
 
     # What takes seconds, before the first fork. tensordict loads pandas where there is one.
     for module in ("proposer_rl.tasks.mazes.task", "pandas"):
         import_module(module)
     composing.remember()
-    shown.draw_run = lambda folder, title: folder / "run.png"  # a quarter of what a child computes
+    watch.draw_run = lambda folder, title: folder / "run.png"  # a quarter of what a child computes
     gc.freeze()  # a child that looks for garbage would copy all that memory
     gc.enable()
 
@@ -191,6 +189,8 @@ def _has_ended(child: int) -> bool:
 
 
 def _become_child(request: Request, said: int, counted: int) -> None:
+    from proposer_rl.cli import train
+
     code = 1
     try:
         for signum in request.ignored:
@@ -210,7 +210,7 @@ def _become_child(request: Request, said: int, counted: int) -> None:
             _give_up_override()
         tqdm.set_lock(RLock())  # its own would be shared with other processes
         sys.argv = ["proposer-train", *request.arguments]
-        import_module(request.module).main()
+        train.main()
         code = 0
     except SystemExit as end:
         code = int(end.code or 0)

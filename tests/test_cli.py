@@ -246,7 +246,7 @@ def test_an_unforeseen_error_within_a_run_is_no_bad_input_and_none_of_the_disk(
     ("function", "place"),
     [
         ("hydra.core.utils._save_config", "run"),
-        ("proposer_rl.cli.shown.draw_run", "run"),
+        ("proposer_rl.cli.watch.draw_run", "run"),
         ("logging.FileHandler._open", "run/train.log"),
     ],
 )

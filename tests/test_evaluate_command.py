@@ -12,12 +12,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from proposer_rl.cli.eval import main
-from proposer_rl.cli.evaluate import SHOWN, Evaluation, _print
+from proposer_rl.cli.eval import SHOWN, Evaluation, _print, main
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.task import LevelResult
-from proposer_rl.tasks.mazes.level_files import shipped_levels
+from proposer_rl.tasks.mazes.drawings import SETS, read_levels
 
 KEYS = ["success", "return", "greedy_success", "greedy_return"]
 
@@ -85,7 +84,7 @@ def test_the_set_that_comes_along(run: Path, tmp_path: Path, evaluate) -> None:
         for key, value in row.items():
             same = isinstance(value, str) and value == cells[key]
             assert same or float(cells[key]) == pytest.approx(value, rel=1e-5)
-    levels = shipped_levels("shapes")
+    levels = read_levels(SETS["shapes"])
     assert [row["level"] for row in rows[::2]] == list(levels)
     for row in rows:
         assert row["max_steps"] == max(10, 2 * row["path_length"])
@@ -136,7 +135,7 @@ def test_one_checkpoint_of_a_run(run: Path, tmp_path: Path, evaluate) -> None:
             ["{run}", "--levels", "mazes"],
             "--levels mazes: must be one of: shapes, small, a file ",
         ),
-        (["{run}", "--levels", "bad.json"], "bad.json: Expecting property name"),
+        (["{run}", "--levels", "bad.json"], "bad.json: Invalid JSON"),
         (["{run}", "--levels", "small.txt"], "level 'small': 3x5 cells are too few"),
         (["{run}", "-o", "rows.txt"], "--output rows.txt: must end in .json or .csv"),
         (

@@ -1,4 +1,4 @@
-"""Everything that computes, on a GPU; without one, tests/test_devices.py stands for some of it."""
+"""Everything that computes, on a GPU."""
 
 from __future__ import annotations
 

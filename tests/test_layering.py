@@ -10,7 +10,6 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import networkx as nx
-import pytest
 
 PACKAGE = "proposer_rl"
 ROOT = Path(__file__).resolve().parents[1] / PACKAGE
@@ -28,7 +27,7 @@ HEAVY = {"torch", "torchrl", "tensordict"}
 READERS = ("report", "cli.watch", "cli.report")
 # What is above everything: only these commands know of it, and nothing that a run is made of.
 SHOWING = ("report", "play")
-SHOW = {"cli.report", "cli.watch", "cli.play", "cli.evaluate", "cli.shown"}
+SHOW = {"cli.report", "cli.watch", "cli.play", "cli.eval"}
 TRAINING = ("cli.run", "cli.build", "methods", "experiment.loop", "teaching")
 # The names of the package itself, the rooms that know mazes, and an environment with its own walls.
 KNOW_MAZES = ("tasks.mazes", "tasks.view_mazes", "tasks.arena.planes", "api")
@@ -195,39 +194,6 @@ def test_nothing_but_mazes_knows_mazes() -> None:
         assert not any(
             f"{other}.".startswith((".tasks.mazes.", ".tasks.view_mazes.")) for other in graph[name]
         ), name
-
-
-@pytest.mark.parametrize(
-    ("files", "expected"),
-    [
-        ({"a.py": "from proposer_rl import b", "b.py": "from .a import f"}, {"a", "b"}),
-        ({"a/x.py": "from ..b.y import f", "b/y.py": "def f():\n    import proposer_rl.a.x"}, None),
-        ({"a/x.py": "from . import y", "a/y.py": "from .x import f"}, set()),  # one room
-        ({"a.py": "import torch\nfrom proposer_rl.b import f", "b.py": ""}, set()),
-    ],
-)
-def test_circles_are_found(tmp_path: Path, files: dict[str, str], expected: set | None) -> None:
-    for name, source in files.items():
-        path = tmp_path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        (path.parent / "__init__.py").touch()
-        path.write_text(source, encoding="utf-8")
-    assert set(circle(rooms(tmp_path))) == ({"a", "b"} if expected is None else expected)
-
-
-@pytest.mark.parametrize(
-    ("source", "count"),
-    [
-        ("class Maze: ...", 1),
-        ("def f(maze): return maze", 2),
-        ("x = 'a maze'", 1),
-        ("from proposer_rl.tasks.mazes import Level", 1),
-        ('"""Such as mazes."""\n\ndef f():\n    """A maze."""\n    x = 1  # a maze', 0),
-        ('X = 1\n"""Of a maze."""', 0),
-    ],
-)
-def test_mentions_are_found(source: str, count: int) -> None:
-    assert len(mentions(ast.parse(source), "maze")) == count
 
 
 def test_the_docs_show_the_rooms() -> None:

@@ -18,7 +18,7 @@ from proposer_rl.meta.assembly import MixtureSettings, ProblemSettings, Proposer
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.mazes.maze_settings import MazeSettings
+from proposer_rl.tasks.mazes.task import MazeSettings
 from tests.commands import LITTLE
 from tests.tiny import composed
 

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 
 import proposer_rl as prl
 from proposer_rl.cli.errors import exit_code
-from proposer_rl.tasks.point_masses.task import PointMassEnv
+from proposer_rl.tasks.point_masses import PointMassEnv
 from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv
 from tests.tasks.gymnasium.odd import LIMIT, Line
 from tests.tasks.view_mazes.oracles import random_levels

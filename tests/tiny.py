@@ -21,23 +21,23 @@ from proposer_rl.task import ComputeContext, Task
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings
 from proposer_rl.tasks.mazes import Level, planes
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
-from proposer_rl.tasks.mazes.maze_settings import (
+from proposer_rl.tasks.mazes.task import (
     DistributionSettings,
     MazeEvaluationSettings,
     MazeSettings,
+    MazeTask,
     SpaceSettings,
     UNetSettings,
 )
-from proposer_rl.tasks.mazes.task import MazeTask
-from proposer_rl.tasks.point_masses.task import GateSettings, PointMassTask
+from proposer_rl.tasks.point_masses import GateSettings, PointMassTask
 from proposer_rl.tasks.ranges import RangeSettings
 from proposer_rl.tasks.view_mazes.task import ViewEvaluationSettings, ViewMazeSettings, ViewMazeTask
-from proposer_rl.tasks.view_mazes.view_distributions import (
+from proposer_rl.tasks.view_mazes.view_env import ViewNetworkSettings
+from proposer_rl.tasks.view_mazes.view_levels import (
     PerfectSettings,
     ScatteredSettings,
     ViewSpaceSettings,
 )
-from proposer_rl.tasks.view_mazes.view_env import ViewNetworkSettings
 
 EXAMPLES = str(Path(__file__).parents[1] / "examples")
 EVALUATE = ExactEvaluator(max_steps=8)

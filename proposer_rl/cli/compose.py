@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from proposer_rl.cli.config import RunConfig, read_config
 from proposer_rl.cli.groups import Invocation, check_groups, python_path
 from proposer_rl.cli.run import carry_out
-from proposer_rl.cli.shown import show_run
+from proposer_rl.cli.watch import show_run
 from proposer_rl.recipes import composed, plain_values, storable
 from proposer_rl.runs.folder import storage
 from proposer_rl.runs.process import StopSignals

@@ -19,10 +19,8 @@ from proposer_rl.learning import SolverSettings
 from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import CANNOT_BE_CALLED, completed
 from proposer_rl.recipes import maker
-from proposer_rl.runs.folder import read_bounded
 from proposer_rl.settings import arguments, settings, within
 
-LARGEST_FILE = 10**6
 # What a task's maker is given beside the task's own settings.
 GIVEN_TO_TASKS = ("solver", "context")
 
@@ -188,6 +186,7 @@ def checked_config(values: Mapping[str, Any], file: Path) -> RunConfig:
 def stored_config(file: Path) -> Any:
     """Returns the content of a run's ``config.json`` unchecked."""
     try:
-        return json.loads(read_bounded(file, LARGEST_FILE))
+        with storage(file, "read"):
+            return json.loads(file.read_bytes())
     except (ValueError, RecursionError):
-        raise ConfigError(f"{file}: is no JSON of at most {LARGEST_FILE:,} bytes") from None
+        raise ConfigError(f"{file}: is no JSON") from None

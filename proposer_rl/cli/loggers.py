@@ -78,13 +78,13 @@ def _wandb(
         config=dict(config),
         reinit="create_new",  # a run of the caller's own goes on
     )
+    code = 1
     try:
         # All that comes of one update is one row. A run that goes on repeats rows, which are there.
         yield lambda found, step: run.log(dict(found), step=step)
-    except BaseException:
-        run.finish(exit_code=1)
-        raise
-    run.finish()
+        code = 0
+    finally:
+        run.finish(exit_code=code)
 
 
 def wandb_id(path: Path) -> str:

@@ -79,7 +79,7 @@ def _compose_and_run() -> None:
         refuse(cause, *(folder for folder, _ in COMMAND))
     for folder, failed_before in COMMAND:
         if failed_before is not None:
-            from proposer_rl.cli.shown import show_sweep
+            from proposer_rl.cli.watch import show_sweep
 
             show_sweep(folder)
             failed = _failures(folder).items() - failed_before.items()
@@ -101,7 +101,7 @@ def _main(hydra_config: DictConfig) -> float:
         with signals:  # already now: amid imports is no place to stop
             from proposer_rl.cli.config import read_config  # only now: it takes seconds
             from proposer_rl.cli.run import train
-            from proposer_rl.cli.shown import show_run
+            from proposer_rl.cli.watch import show_run
 
             return train(read_config(hydra_config), asked, signals, show_run)
     except Exception as error:

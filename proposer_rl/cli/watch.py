@@ -1,25 +1,43 @@
-"""``bin/watch`` and ``proposer-watch``: shows running experiments; nothing is written."""
+"""``bin/watch`` and ``proposer-watch``: shows running experiments; nothing is written.
+
+And the picture and the lines with which a run ends, and the table with which a sweep does: training
+is given them and knows nothing of what draws; figures take a while to import.
+"""
 
 from __future__ import annotations
 
 import argparse
+import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from rich.console import Console
+import numpy as np
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
+from rich.table import Table
+from rich.text import Text
 
-from proposer_rl.cli.errors import command, number
-from proposer_rl.report.terminal import find_progress, overview
+from proposer_rl.cli.errors import command, number, say
+from proposer_rl.report.reading import UnreadableRun, begun, read_run
+from proposer_rl.report.runs import Run
+from proposer_rl.runs.folder import FAILURE, is_rate
+from proposer_rl.runs.process import PROGRESS
+from proposer_rl.runs.records import LONGEST_TEXT, Column, level_text, printable, small_json, words
 
 EPILOG = """\
 examples:
   bin/watch outputs/perf_gain/2026-11-21_00-37-50_seed_0   one run
   bin/watch sweeps/quick                                   a sweep: one line for each run
   bin/watch sweeps/quick --once                            print once, for a file or a pipe"""
+BLOCKS = " ▁▂▃▄▅▆▇█"
+COLOURS = {"finished": "green", "failed": "red", "unfinished": "yellow", "starting": "blue"}
+WIDTH = 16  # characters of a curve
+STOPPED = 128  # a greater exit code is that of a signal: the run can go on
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -56,6 +74,205 @@ def _parser() -> argparse.ArgumentParser:
         help="between two refreshes (default: 2)",
     )
     return parser
+
+
+def duration(seconds: float) -> str:
+    """Returns seconds as text in the unit that reads best."""
+    for unit, size in (("d", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The state of one run's folder.
+
+    Attributes:
+        folder: of the run.
+        runs: its seeds; empty if it has not measured anything yet, or failed before.
+        failure: why it failed, in one line; empty if it did not.
+        age: seconds since something was written.
+        activity: what it was doing then, and how long the rest takes; empty if it does not say or
+            has failed.
+    """
+
+    folder: Path
+    runs: tuple[Run, ...]
+    failure: str
+    age: float
+    activity: str = ""
+
+    @property
+    def state(self) -> str:
+        """The state in a word: failed, finished, unfinished (or running), or starting."""
+        if self.failure:
+            return "failed"
+        if not self.runs:
+            return "starting"
+        return "finished" if all(run.finished for run in self.runs) else "unfinished"
+
+
+def read_progress(folder: Path) -> Progress:
+    """Returns the state of a run's folder, also of one without measurements."""
+    failure = _failure(folder)
+    try:
+        runs = tuple(read_run(folder))
+    except UnreadableRun as error:
+        runs = ()
+        if not failure and (folder / "metrics.csv").is_file():
+            failure = printable(str(error).removeprefix(f"{folder}: "))
+    activity = "" if failure else _doing(folder)
+    if activity and runs:
+        activity = ", ".join(filter(None, [activity, _left(runs[0])]))
+    return Progress(folder, runs, failure, _seconds_since(folder), activity)
+
+
+def find_progress(folder: Path) -> list[Progress]:
+    """Returns the states of all runs in a folder, or of the folder itself."""
+    found = [read_progress(path) for path in begun(folder)]
+    if not found:
+        raise UnreadableRun(f"{folder}: no run in it, finished or begun")
+    return found
+
+
+def _failure(folder: Path) -> str:
+    if not (folder / FAILURE).is_file():
+        return ""
+    match small_json(folder / FAILURE):
+        case {"exit_code": int(code)} if code > STOPPED:
+            return ""
+        case {"message": message}:
+            return printable(str(message))[:LONGEST_TEXT]
+    return f"{FAILURE} cannot be read"
+
+
+def _doing(folder: Path) -> str:
+    """Returns a run's present activity; empty where it is over or the file cannot be read."""
+    match small_json(folder / PROGRESS):
+        case {"doing": str(text)}:
+            return printable(text)[:LONGEST_TEXT]
+    return ""
+
+
+def _left(run: Run) -> str:
+    """Returns how long the rest takes at the mean speed so far; empty before the first update."""
+    if not run.updates or run.planned is None:
+        return ""
+    rest = run.last("seconds") / run.updates * (run.planned - run.updates)
+    since = time.time() - (run.folder / "metrics.csv").stat().st_mtime
+    return f"about {duration(max(rest - since, 0.0))} left"
+
+
+def _seconds_since(folder: Path) -> float:
+    """Returns how long ago something in a folder was written; 0 where it is empty."""
+    times = []
+    for entry in os.scandir(folder):
+        with suppress(FileNotFoundError):  # its temporary name is gone once a file is written
+            if entry.is_file():
+                times.append(entry.stat().st_mtime)
+    return max(time.time() - max(times), 0.0) if times else 0.0
+
+
+def overview(found: Sequence[Progress]) -> RenderableType:
+    """Returns a table with a line for each run, and the number of runs in each state."""
+    parent = os.path.commonpath([progress.folder.parent for progress in found])
+    names = [printable(str(progress.folder.relative_to(parent))) for progress in found]
+    table = Table(box=None, pad_edge=False)
+    table.add_column("run", overflow="fold")
+    columns = {"state": 10, "updates": 7, "": WIDTH, "last": 16, "written": 10}
+    for name, width in columns.items():
+        table.add_column(name, no_wrap=True, min_width=width)
+    for name, progress in zip(names, found, strict=True):
+        table.add_row(
+            Text(name),
+            Text(progress.state, style=COLOURS[progress.state]),
+            *map(Text, _measured(progress.runs)),
+            f"{duration(progress.age)} ago",
+        )
+    told = [
+        Text(f"failed: {name}: {progress.failure}", style="red")
+        if progress.failure
+        else Text(f"{name}: {progress.activity}")
+        for name, progress in zip(names, found, strict=True)
+        if progress.failure or progress.activity
+    ]
+    states = [progress.state for progress in found]
+    counts = ", ".join(f"{states.count(state)} {state}" for state in COLOURS if state in states)
+    return Group(table, *told, Text(f"{len(found)} runs: {counts}"))
+
+
+def _measured(runs: Sequence[Run]) -> tuple[str, str, str]:
+    """Returns the updates, the headline's curve and its last value as texts: the seeds' mean."""
+    if not runs:
+        return "–", "", ""
+    run = runs[0]
+    # Of seeds that are trained together one can have a row more than another.
+    known = min(len(each.metrics[run.headline]) for each in runs)
+    values = np.mean([each.metrics[run.headline][:known] for each in runs], 0)
+    low, high = (0, 1) if is_rate(run.headline) else (float(values.min()), float(values.max()))
+    updates = f"{run.updates}/{run.planned}" if run.planned else str(run.updates)
+    curve = sparkline(_some(values), low, high)
+    return updates, curve, f"{words(run.headline)} {values[-1]:.3f}"
+
+
+def sparkline(values: Iterable[float], low: float, high: float) -> str:
+    """Returns values as blocks of rising height; values outside are drawn at the edge."""
+    span = (high - low) or 1.0
+    steps = [(value - low) / span * (len(BLOCKS) - 1) for value in values]
+    return "".join(BLOCKS[min(max(round(step), 0), len(BLOCKS) - 1)] for step in steps)
+
+
+def _some(values: Sequence[float] | Column) -> Sequence[float] | Column:
+    """Returns the values, or as many of them, evenly spaced, as a curve has characters."""
+    if len(values) <= WIDTH:
+        return values
+    return np.asarray(values)[np.linspace(0, len(values) - 1, WIDTH).round().astype(int)]
+
+
+def show_sweep(folder: Path) -> None:
+    """Lists the runs of a sweep that is over."""
+    Console().print(overview(find_progress(folder)))
+
+
+def draw_run(folder: Path, title: str) -> Path:
+    """Draws ``run.png`` of a run's folder; returns the file."""
+    from proposer_rl.report import figures
+
+    return figures.draw_run(folder, title)
+
+
+def show_run(folder: Path, name: str, result: Mapping[str, Any]) -> None:
+    """Draws the picture of a run that is over, and prints its summary."""
+    picture, seeds = draw_run(folder, name), result["seeds"]
+    for seed, reached, final in zip(
+        seeds, result["updates_to_threshold"], result["final"], strict=True
+    ):
+        say(f"{result['method']}, seed {seed}: {_outcome_text(result, reached, final)}")
+    say(_cost_text(result, len(seeds)))
+    say(f"Files: {folder}  (picture: {picture.name})")
+
+
+def _outcome_text(
+    result: Mapping[str, Any], reached: int | None, final: Mapping[str, float]
+) -> str:
+    headline = result["headline"]
+    level = f"{level_text(headline, result['threshold'])} {headline.replace('_', ' ')}"
+    end = f"{final[headline]:.1%}" if is_rate(headline) else f"{final[headline]:.3g}"
+    outcome = (
+        f"{level} after {reached} updates"
+        if reached is not None
+        else f"{level} not reached in {result['updates']} updates (censored)"
+    )
+    return f"{outcome}; {end} at the end."
+
+
+def _cost_text(result: Mapping[str, Any], seeds: int) -> str:
+    together = f" for each of {seeds} seeds" if seeds > 1 else ""
+    return (
+        f"Cost: {result['frames']:,} frames of the Solver{together}, "
+        f"{result['curriculum_frames']:,} of its curriculum, {result['seconds']:.0f} s."
+    )
 
 
 if __name__ == "__main__":

@@ -17,8 +17,8 @@ from proposer_rl.learning.objective import located as located
 from proposer_rl.learning.ppo import PPO as PPO
 from proposer_rl.learning.ppo import Replica as Replica
 from proposer_rl.learning.ppo import Update as Update
+from proposer_rl.learning.ppo import agent_values as agent_values
+from proposer_rl.learning.ppo import agent_weights as agent_weights
+from proposer_rl.learning.ppo import load_agent as load_agent
 from proposer_rl.learning.rollout import RolloutCollector as RolloutCollector
 from proposer_rl.learning.rollout import RolloutPolicy as RolloutPolicy
-from proposer_rl.learning.snapshot import agent_values as agent_values
-from proposer_rl.learning.snapshot import agent_weights as agent_weights
-from proposer_rl.learning.snapshot import load_agent as load_agent

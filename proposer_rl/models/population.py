@@ -292,17 +292,15 @@ def check_torch_defaults() -> None:
     Raises:
         TorchDefaultsError: naming torch's own setting, and how to put it back.
     """
-    dtype, device = torch.get_default_dtype(), torch.empty(0).device
-    if dtype != torch.float32:
-        raise TorchDefaultsError(
-            f"torch.get_default_dtype() is {dtype}, and must be torch.float32: put it back with "
-            "torch.set_default_dtype(torch.float32)"
-        )
-    if device.type != "cpu":
-        raise TorchDefaultsError(
-            f"torch.get_default_device() is {device}, and must be cpu: put it back with "
-            "torch.set_default_device(None), or leave the `with torch.device(...)`"
-        )
+    for name, found, wanted, back in (
+        ("dtype", torch.get_default_dtype(), torch.float32, "dtype(torch.float32)"),
+        ("device", torch.empty(0).device, torch.device("cpu"), "device(None)"),
+    ):
+        if found != wanted:
+            raise TorchDefaultsError(
+                f"torch.get_default_{name}() is {found}, and must be {wanted}: put it back with "
+                f"torch.set_default_{back}"
+            )
 
 
 def use_device(device: torch.device) -> None:

@@ -107,15 +107,7 @@ def listen(port: int) -> socket.socket:
     Raises:
         OSError: if it cannot be had.
     """
-    listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    try:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.bind((HOSTS[0], port))
-        listening.listen()
-    except OSError:
-        listening.close()
-        raise
-    return listening
+    return socket.create_server((HOSTS[0], port))
 
 
 def server(app: Starlette) -> uvicorn.Server:

@@ -19,7 +19,7 @@ from proposer_rl.report.runs import Run, share_map
 from proposer_rl.report.statistics import median_of
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.runs.folder import is_rate
-from proposer_rl.runs.records import LevelRecord, number, picture
+from proposer_rl.runs.records import LevelRecord, number, pixels
 
 Json = Any
 DIGITS = 5
@@ -201,14 +201,13 @@ def _level(level: LevelRecord, pictures: dict[str, int]) -> Json:
 
 @lru_cache(4 * LEVELS * STAGES[0])
 def _small(stored: str | None) -> str | None:
-    """Returns a picture as PNG in base64, scaled down for display; None if it cannot be read.
+    """Returns a picture as PNG in base64, scaled down for display; None where there is none.
 
     Results are kept, since fewer stages are tried with the same pictures if all do not fit.
     """
-    pixels = picture(stored)
-    if pixels is None:
+    if stored is None:
         return None
-    image, file = Image.fromarray(pixels), io.BytesIO()
+    image, file = Image.fromarray(pixels(stored)), io.BytesIO()
     image.thumbnail((SIDE, SIDE))
     image.save(file, format="PNG", optimize=True)
     return base64.b64encode(file.getvalue()).decode()

@@ -30,7 +30,7 @@ from proposer_rl.report.style import (
     style,
 )
 from proposer_rl.runs.folder import is_rate
-from proposer_rl.runs.records import Column, LevelRecord, SampleRecord, number, picture, words
+from proposer_rl.runs.records import Column, LevelRecord, SampleRecord, number, pixels, words
 
 MOST_PANELS = 12
 STAGES = 5
@@ -270,13 +270,12 @@ def _draw_row(figure: FigureBase, levels: Sequence[LevelRecord], title: str) -> 
 
 
 def _show(places: Sequence[Axes], levels: Sequence[LevelRecord]) -> None:
-    """Draws pictures of levels; a place stays empty where there is none that can be shown."""
+    """Draws pictures of levels; a place stays empty where there is none."""
     for axes in places:
         axes.set_axis_off()
     for axes, level in zip(places, levels, strict=False):
-        image = picture(level.picture)
-        if image is not None:
-            axes.imshow(image)
+        if level.picture is not None:
+            axes.imshow(pixels(level.picture))
 
 
 def heat_maps(study: Study) -> Drawing | None:

@@ -85,7 +85,7 @@ def read_run(folder: Path) -> list[Run]:
     """
     try:
         return _read_study(folder) if (folder / STUDY).exists() else _read_folder(folder)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except Exception as error:  # of xz and pandas they are of no common kind
         missing = isinstance(error, KeyError)
         reason = f"an entry {error} is missing" if missing else str(error) or repr(error)
         raise UnreadableRun(f"{folder}: {printable(reason)[:300]}") from error
@@ -137,10 +137,7 @@ def _read_study(folder: Path) -> list[Run]:
 
 def _table(file: Path) -> pd.DataFrame:
     """Returns a table of a study with its cells as text, NaN for empty ones."""
-    try:
-        return pd.read_csv(file, dtype=str, keep_default_na=False, na_values=[""], index_col=False)
-    except Exception as error:  # of xz, whose errors are of no common kind, or of pandas
-        raise ValueError(f"{file.name}: {error}") from error
+    return pd.read_csv(file, dtype=str, keep_default_na=False, na_values=[""], index_col=False)
 
 
 def _by_run(folder: Path, name: str) -> dict[str, pd.DataFrame]:
@@ -181,8 +178,6 @@ def _runs(
     samples: Sequence[SampleRecord],
 ) -> list[Run]:
     """Returns a run for each seed; ``facts`` have ``updates`` only of finished runs."""
-    if not len(metrics):
-        raise ValueError("metrics.csv has no rows yet")
     task = checked(TaskFacts, facts["task"], "run.json: task")
     pictured = dict[str, list[LevelRecord]]
     sheets = [checked(pictured, row.pop("levels", {}), "cycles.jsonl: levels") for row in cycles]
@@ -214,10 +209,7 @@ def _optional(file: Path, read: Callable[[Path], list[Any]]) -> list[Any]:
 
 
 def _read_json(file: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(file.read_text("utf-8-sig"))  # with the mark of editors of Windows
-    except ValueError as error:
-        raise ValueError(f"{file.name}: {error}") from error
+    value = json.loads(file.read_text("utf-8-sig"))  # with the mark of editors of Windows
     return checked(dict[str, Any], value, file.name)
 
 

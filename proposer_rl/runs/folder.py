@@ -13,13 +13,14 @@ import errno
 import json
 import os
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 Number = int | float
+T = TypeVar("T")
 
 # What a run writes row by row; all else in its folder, tables of its user's too, is left alone.
 TABLES = ("curriculum.jsonl", "cycles.jsonl", "levels.jsonl", "metrics.csv", "training.csv")
@@ -56,8 +57,8 @@ class RunFolder:
                 first row makes the header); for ``.jsonl`` whatever JSON can hold.
 
         Raises:
-            ValueError: if a value is no number, or the keys are not those of the header.
-            TypeError: if JSON cannot hold it.
+            ValueError: if the keys are not those of the header.
+            TypeError: if a value is no number, or JSON cannot hold it.
             StorageError: if the disk does not take the row.
         """
         path = self.path / name
@@ -124,26 +125,17 @@ def read_csv(path: str | os.PathLike[str]) -> list[dict[str, Number]]:
         ValueError: naming the file and the line that is no such row.
         FileNotFoundError: if there is no such file.
     """
-    rows: list[dict[str, Number]] = []
-    lines = _lines(Path(path))
-    header = next(lines, ("", ""))[1].split(",")
-    for place, line in lines:
-        cells = line.split(",")
-        if len(cells) != len(header):
-            raise ValueError(f"{place}: {len(cells)} cells under {len(header)} columns")
-        rows.append({name: _number(place, cell) for name, cell in zip(header, cells, strict=True)})
-    return rows
+    header = (_first_line(Path(path)) or "").split(",")
+
+    def row(line: str) -> dict[str, Number]:
+        return dict(zip(header, map(_number, line.split(",")), strict=True))
+
+    return [*_parsed(Path(path), row, 1)]
 
 
 def read_jsonl(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
     """Returns the complete rows of a ``.jsonl`` table; a ValueError names any other line."""
-    rows = []
-    for place, line in _lines(Path(path)):
-        try:
-            rows.append(dict(json.loads(line)))
-        except (TypeError, ValueError, RecursionError) as error:
-            raise ValueError(f"{place}: not a JSON object: {error}") from None
-    return rows
+    return [*_parsed(Path(path), lambda line: dict(json.loads(line)))]
 
 
 def read_table(path: Path) -> Sequence[Mapping[str, Any]]:
@@ -178,14 +170,6 @@ def write_atomically(path: Path, content: bytes, durably: bool = True) -> None:
             _sync_folder(path.parent)
 
 
-def read_bounded(path: Path, largest: int) -> bytes:
-    """Returns the content of a file; a ValueError says where it has more than ``largest`` bytes."""
-    with storage(path, "read"):
-        if path.stat().st_size > largest:
-            raise ValueError(f"{path}: is larger than {largest:,} bytes")
-        return path.read_bytes()
-
-
 @contextmanager
 def storage(path: Path, action: str = "write") -> Iterator[None]:
     """Turns any error of the operating system inside into one that names the file.
@@ -207,43 +191,36 @@ def _csv(path: Path, row: Mapping[str, object], header: str | None) -> str:
             f"{path}: a row has {', '.join(row)}; its columns are {', '.join(columns)}, and have "
             "no commas, quotes or line breaks in their names"
         )
-    line = ",".join(_cell(path, name, row[name]) for name in columns)
+    line = ",".join(map(_text, map(row.__getitem__, columns)))
     return line if header is not None else ",".join(columns) + "\n" + line
 
 
-def _cell(path: Path, column: str, value: object) -> str:
-    if isinstance(value, float):
-        return float.__repr__(value)  # the shortest text that reads back as the same number
-    if isinstance(value, int) and not isinstance(value, bool):
-        return int.__repr__(value)
-    raise ValueError(f"{path}: {column} must be an int or a float, got {value!r}")
+def _text(value: Any) -> str:
+    """Returns the shortest text that reads back as the same number."""
+    return int.__repr__(value) if isinstance(value, int) else float.__repr__(value)
 
 
-def _number(place: str, text: str) -> Number:
-    for kind in (int, float):
-        with suppress(ValueError):
-            return kind(text)
-    raise ValueError(f"{place}: {text!r} is not a number")
+def _number(text: str) -> Number:
+    return int(text) if text.removeprefix("-").isdigit() else float(text)
 
 
-def _lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Yields each complete line, after words that say where it is.
+def _parsed(path: Path, parse: Callable[[str], T], first: int = 0) -> Iterator[T]:
+    """Yields what is parsed of each complete line, from one on; a ValueError says where it fails.
 
-    Line ends of Windows, and the mark that editors there put in front, are no part of it.
+    Line ends of Windows, and the mark that editors there put in front, are no part of a line.
     """
     with open(path, "rb") as file:
-        for number, line in enumerate(file, 1):
-            if line.endswith(b"\n"):
-                place = f"{path}, line {number}"
+        for number, line in enumerate(file):
+            if number >= first and line.endswith(b"\n"):
                 try:
-                    yield place, line.decode("utf-8-sig").rstrip("\r\n")
-                except UnicodeDecodeError as error:
-                    raise ValueError(f"{place}: {error}") from None
+                    yield parse(line.decode("utf-8-sig").rstrip("\r\n"))
+                except (TypeError, ValueError, RecursionError) as error:
+                    raise ValueError(f"{path}, line {number + 1}: {error}") from None
 
 
 def _first_line(path: Path) -> str | None:
     """Returns the first line of a table; None without one."""
-    return next((line for _, line in _lines(path)), None) if path.exists() else None
+    return next(_parsed(path, str), None) if path.exists() else None
 
 
 def _row_ends(path: Path) -> list[int]:

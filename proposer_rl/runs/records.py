@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from pydantic import BaseModel, FiniteFloat, TypeAdapter, ValidationError
 
-from proposer_rl.runs.folder import is_rate, read_bounded
+from proposer_rl.runs.folder import is_rate
 
 LARGEST = 1e100  # what is greater is no measurement, and overflows when it is drawn
 LONGEST_TEXT = 400  # characters of what is shown in a line
@@ -94,10 +94,10 @@ def checked(kind: type[T], value: Any, where: str) -> T:
         raise ValueError(": ".join(filter(None, [where, place, first["msg"]]))) from error
 
 
-def small_json(path: Path, largest: int = 2**20) -> Any:
+def small_json(path: Path) -> Any:
     """Returns the content of a run's small JSON file; None if it cannot be read."""
     try:
-        return json.loads(read_bounded(path, largest))
+        return json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError):
         return None
 
@@ -115,14 +115,6 @@ def encoded(text: str) -> bytes:
 def anywhere(text: str) -> str:
     """Returns text with absolute paths cut to their last part, to be free of the machine."""
     return re.sub(r"(?<![\w./])/(?:[\w.\-]+/)+", "", text)
-
-
-def picture(encoded: str | None) -> NDArray[np.uint8] | None:
-    """Returns a recorded picture, uint8 [H, W, 3]; None where there is none or it is damaged."""
-    try:
-        return None if encoded is None else pixels(encoded)
-    except (ValueError, OSError, SyntaxError):  # of base64, PIL and its PNG decoder
-        return None
 
 
 def number(value: Any) -> float:

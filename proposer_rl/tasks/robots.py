@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
+from proposer_rl.tasks.batched_envs import BatchedEnv, Step, Values
 
 DT = 0.1  # seconds of a step
 APART = 1.0  # metres between two edges of the terrain

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 
 from proposer_rl.tasks.mazes import Level, MazeEnv, generate_levels, successors
 from proposer_rl.tasks.mazes.levels import cell_index
-from proposer_rl.tasks.point_masses.task import GATE, PointMassEnv
+from proposer_rl.tasks.point_masses import GATE, PointMassEnv
 from research.benchmarks.plain_env import PlainMaze
 from research.benchmarks.results import Options, Result, Row
 from research.benchmarks.timing import interleave, rate, ratio

@@ -7,9 +7,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.view_mazes.view_distributions import scattered_walls
 from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv
-from proposer_rl.tasks.view_mazes.view_levels import ViewLevel
+from proposer_rl.tasks.view_mazes.view_levels import ViewLevel, scattered_walls
 from research.benchmarks.environment import through_torchrl
 from research.benchmarks.jaxued_peer import LEAN, WAYS, WRAPPER
 from research.benchmarks.peer import jaxued_maze

@@ -11,7 +11,7 @@ from proposer_rl.curricula import Curriculum, TaskStudent, outcome_of
 from proposer_rl.experiment.side_by_side import SideBySide
 from proposer_rl.learning import PPO, PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.mazes.maze_settings import UNetSettings
+from proposer_rl.tasks.mazes.task import UNetSettings
 from tests.tiny import tiny_task
 
 # What holds of a curriculum does not hang on how much a Solver makes of its levels.

@@ -17,7 +17,7 @@ from proposer_rl.curricula.optimal_transport import (
 from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components, build
 from proposer_rl.tasks.mazes import SpecificationSpace
-from proposer_rl.tasks.mazes.maze_settings import DistributionSettings, SpaceSettings
+from proposer_rl.tasks.mazes.task import DistributionSettings, SpaceSettings
 from proposer_rl.tasks.parameters import ParameterSpace, intervals
 from tests.curricula.scripted import Scripted, step
 from tests.tiny import tiny_task

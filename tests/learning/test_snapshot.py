@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from proposer_rl.learning.snapshot import complete_adam
+from proposer_rl.learning.ppo import complete_adam
 
 
 def test_state_made_in_advance_changes_no_step() -> None:

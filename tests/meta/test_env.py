@@ -22,7 +22,7 @@ from proposer_rl.meta.rewards import (
 )
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.mazes.maze_settings import UNetSettings
+from proposer_rl.tasks.mazes.task import UNetSettings
 from tests.tiny import evaluate, tiny_task
 
 K, P, C, E, L = 3, 4, 2, 6, 3

@@ -5,29 +5,19 @@ A share of 2,000 replications has a standard error of 0.005: what is asked for i
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from scipy import stats
 
-from proposer_rl.report.comparisons import decisions, waiting_outcome
-from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import (
-    ERROR,
     Interval,
     difference_of,
-    holm,
     mean_of,
     median_of,
     probability_of_improvement,
 )
-from proposer_rl.report.studies import Group, Study
-from proposer_rl.runs.records import TaskFacts
-from tests.report.folders import TASK, config
 
 REPLICATIONS, ENOUGH = 2000, 0.93
 Law = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
@@ -107,78 +97,3 @@ def test_intervals_of_an_improvement_cover(probability: float, spread: float, se
     found = [probability_of_improvement(a, b) for a, b in zip(one, other, strict=True)]
     assert covered(found, probability) >= ENOUGH
     assert all(interval.high - interval.low > 0.1 for interval in found)
-
-
-def study_of(curves: dict[str, np.ndarray], proposer: str = "") -> Study:
-    """A study of methods whose runs have these curves, [seeds, evaluations]."""
-    groups = []
-    for method, rows in curves.items():
-        count = rows.shape[1]
-        updates = np.arange(count) * 10.0
-        cost = {name: updates for name in ("frames", "curriculum_frames", "evaluations", "seconds")}
-        runs = [
-            Run(
-                folder=Path(f"{method}_{seed}"),
-                seed=seed + 100 * len(groups),  # others, so that they are no pairs
-                shared_by=1,
-                config=config(method, seed),
-                facts={},
-                task=TaskFacts.model_validate(TASK),
-                finished=True,
-                metrics=pd.DataFrame(
-                    {"updates": updates, **cost, "id_success": row, "ood_success": row}
-                ),
-                training=pd.DataFrame(),
-                cycles=[{"updates": 0, "total_reward": [1.0]}] if method == proposer else [],
-                samples=[],
-            )
-            for seed, row in enumerate(rows)
-        ]
-        groups.append(Group(method, tuple(runs)))
-    return Study("s", tuple(groups), 0.8)
-
-
-def learning(rng: np.random.Generator, seeds: int, skewed: bool) -> np.ndarray:
-    """Curves [seeds, 7] that grow to a height which varies from seed to seed."""
-    ends = rng.beta(5, 2, seeds) if skewed else rng.normal(0.8, 0.05, seeds)
-    slow = rng.lognormal(0, 0.5, seeds)
-    return ends[:, None] * np.linspace(0, 1, 7)[None] ** slow[:, None]
-
-
-def along_training(rng: np.random.Generator, seeds: int, skewed: bool = False) -> np.ndarray:
-    """The primary outcome of runs that learn, [seeds]."""
-    return np.trapezoid(learning(rng, seeds, skewed), axis=1) / 6
-
-
-@pytest.mark.parametrize("skewed", [False, True])
-@pytest.mark.parametrize("seeds", [5, 10])
-def test_equal_methods_are_rarely_different(seeds: int, skewed: bool) -> None:
-    """A verdict asks for more than this test: that the winner has learnt."""
-    rng = np.random.default_rng(0)
-    pairs = ([along_training(rng, seeds, skewed) for _ in "ab"] for _ in range(REPLICATIONS))
-    assert np.mean([difference_of(*pair).p <= ERROR for pair in pairs]) <= 0.06
-
-
-def test_of_many_equal_methods_none_is_better_more_often() -> None:
-    rng = np.random.default_rng(0)
-    wrong = []
-    for _ in range(300):
-        pairs = itertools.combinations([along_training(rng, 5) for _ in "abcdef"], 2)
-        wrong.append(min(holm([difference_of(*pair).p for pair in pairs])) <= ERROR)
-    assert np.mean(wrong) <= 0.08
-
-
-def test_a_real_difference_is_found() -> None:
-    rng = np.random.default_rng(0)
-    found = 0
-    for _ in range(50):
-        curves = {"a": learning(rng, 10, False), "b": learning(rng, 10, False) ** 3}
-        (decision,) = set(decisions(study_of(curves)).values())
-        found += decision.winner == "a"
-    assert found > 40
-
-
-def test_an_interval_of_updates_stays_within_the_run() -> None:
-    study = study_of({"a": 1.2 * learning(np.random.default_rng(0), 5, False)})
-    interval = waiting_outcome(study).median(study.groups[0])
-    assert interval is not None and 0 <= interval.low <= interval.estimate <= interval.high <= 60

@@ -11,9 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from proposer_rl.cli.watch import main
-from proposer_rl.report import terminal
-from proposer_rl.report.terminal import BLOCKS, duration, find_progress, read_progress, sparkline
+from proposer_rl.cli import watch as terminal
+from proposer_rl.cli.watch import BLOCKS, duration, find_progress, main, read_progress, sparkline
 from tests.report.folders import TASK, write_run
 
 
@@ -79,7 +78,7 @@ def test_an_unreadable_run_is_said_to_have_failed(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run")
     (folder / "metrics.csv").write_text("a,b\n1,x\n")
     progress = read_progress(folder)
-    assert progress.state == "failed" and "'x' is not a number" in progress.failure
+    assert progress.state == "failed" and "could not convert" in progress.failure
 
 
 def test_the_age_is_that_of_the_newest_file(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ import pytest
 import torch
 from torch.utils._pytree import tree_leaves
 
+from proposer_rl.cli.eval import load
 from proposer_rl.cli.eval import main as evaluate
-from proposer_rl.cli.evaluate import load
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from research.scores import main
 from tests.commands import call

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
+from proposer_rl.tasks.batched_envs import BatchedEnv, Step, Values
 
 # What is seen of a level, with the middle and half the width of its usual range.
 PHYSICS = {

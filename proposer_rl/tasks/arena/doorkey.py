@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
+from proposer_rl.tasks.batched_envs import BatchedEnv, Step, Values
 
 LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE = range(6)  # and 6, which does nothing
 OPEN, CLOSED, LOCKED = range(3)

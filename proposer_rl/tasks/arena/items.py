@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from proposer_rl.tasks.arena.planes import FAR, ReachEnv, goal
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values, uniform
+from proposer_rl.tasks.batched_envs import BatchedEnv, Step, Values, uniform
 
 ITEMS, SYMBOLS, ANSWERS, LONGEST = 200, 24, 4, 17
 

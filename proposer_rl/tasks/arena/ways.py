@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
+from proposer_rl.tasks.batched_envs import BatchedEnv, Step, Values
 
 DEEP = 0.97  # from which depth on the reward is at the left
 

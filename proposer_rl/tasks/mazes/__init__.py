@@ -5,6 +5,7 @@ from __future__ import annotations
 from gymnasium import register
 
 from proposer_rl.tasks.mazes.distributions import LevelDistribution, SpecificationSpace
+from proposer_rl.tasks.mazes.drawings import draw_level
 from proposer_rl.tasks.mazes.generation import MECHANISMS, generate_levels
 from proposer_rl.tasks.mazes.levels import (
     Level,
@@ -15,7 +16,6 @@ from proposer_rl.tasks.mazes.levels import (
     validate_levels,
 )
 from proposer_rl.tasks.mazes.maze_env import MazeEnv
-from proposer_rl.tasks.mazes.rendering import draw_level
 
 __all__ = [
     "MECHANISMS",

@@ -16,7 +16,7 @@ from proposer_rl.settings import ArgumentError, checked
 from proposer_rl.tasks.mazes.distributions import SpecificationSpace
 from proposer_rl.tasks.mazes.levels import MOVES, Level, validate_levels
 from proposer_rl.tasks.mazes.maze_env import MazeEnv
-from proposer_rl.tasks.mazes.maze_settings import Fractions, MazeSettings, Mechanism, PathLengths
+from proposer_rl.tasks.mazes.task import Fractions, MazeSettings, Mechanism, PathLengths
 
 LEVELS_AHEAD = 16  # levels drawn at a time: one costs almost as much as sixteen
 METADATA = {"render_modes": ["rgb_array", "ansi"], "render_fps": 8}
@@ -37,7 +37,7 @@ class SingleMaze(gymnasium.Env[Any, Any]):
         mechanism: as in :func:`~proposer_rl.tasks.mazes.generation.generate_levels`.
         render_mode: what :meth:`render` gives, a picture or a text.
         **maze: ``height``, ``width``, ``max_steps``, ``step_penalty`` and ``observe_agent`` of
-            :class:`~proposer_rl.tasks.mazes.maze_settings.MazeSettings`.
+            :class:`~proposer_rl.tasks.mazes.task.MazeSettings`.
 
     Raises:
         ArgumentError: if an argument is invalid.
@@ -93,10 +93,8 @@ class SingleMaze(gymnasium.Env[Any, Any]):
         """Begins an episode.
 
         Raises:
-            ValueError: if there are other options than ``"level"``, or that is none of this grid.
+            ValueError: if the level in the options is none of this grid.
         """
-        for unknown in set(options or {}) - {"level"}:
-            raise ValueError(f"options must be among ['level'], got {unknown!r}")
         given = self._read(options["level"]) if options else None
         super().reset(seed=seed)
         if seed is not None:
@@ -111,11 +109,9 @@ class SingleMaze(gymnasium.Env[Any, Any]):
         """Makes a step.
 
         Raises:
-            ValueError: if the action is none.
             gymnasium.error.ResetNeeded: if the episode is over.
         """
-        if not self.action_space.contains(action):
-            raise ValueError(f"action must be a whole number below {len(MOVES)}, got {action!r}")
+        assert self.action_space.contains(action), f"{action!r} invalid"  # as Gymnasium's say it
         if self._state is None:
             raise ResetNeeded("the episode is over: call reset()")
         after = self._env.step(self._state.set("action", torch.tensor(int(action))))["next"]

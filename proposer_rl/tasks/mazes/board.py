@@ -10,7 +10,7 @@ from torch import Tensor
 
 from proposer_rl.models import ActorCritic, cell_maps
 from proposer_rl.task import CellKind
-from proposer_rl.tasks.mazes import evaluation, level_files
+from proposer_rl.tasks.mazes import drawings, evaluation
 from proposer_rl.tasks.mazes.grid_task import GridTask
 from proposer_rl.tasks.mazes.levels import (
     FREE,
@@ -24,7 +24,6 @@ from proposer_rl.tasks.mazes.levels import (
     shortest_way,
     successors,
 )
-from proposer_rl.tasks.mazes.rendering import recorded_drawing
 
 DIGITS = 4  # of the numbers of a map: what can be seen
 
@@ -36,20 +35,15 @@ class Drawings:
         task: whose levels are drawn.
     """
 
-    drawing = staticmethod(recorded_drawing)
+    sets = tuple(drawings.SETS)
 
     def __init__(self, task: GridTask) -> None:
         self._task = task
         self.size = task.grid
-        self.sets = level_files.shipped_sets()
 
     def read(self, rows: Sequence[str]) -> Any:
         """Returns the level that is drawn; see :class:`~proposer_rl.task.Board`."""
-        # The message of a drawing shows it; here it was seen already.
-        try:
-            level = self._task.level.from_text("\n".join(rows))
-        except ValueError as error:
-            raise ValueError(str(error).partition(", got")[0]) from error
+        level = self._task.level.from_text("\n".join(rows))
         self._task.check_level("drawn", level)
         return level
 
@@ -57,17 +51,21 @@ class Drawings:
         """Returns the rows of a level's drawing."""
         return str(level.to_text()).splitlines()
 
+    def drawing(self, record: Mapping[str, Any]) -> list[str]:
+        """Returns the rows of a record's level, without the Solver's path."""
+        return drawings.recorded_drawing(record["text"])
+
     def level_set(self, name: str) -> Mapping[str, Level]:
         """Returns the levels of a shipped set; an agent that turns looks to the right."""
-        return level_files.shipped_levels(name, self._task.level)
+        return drawings.read_levels(drawings.SETS[name], self._task.level)
 
     def read_file(self, text: str) -> Mapping[str, Level]:
         """Returns the levels of a file's text; docs/how_to/levels.md has the format."""
-        return level_files.levels_from_text(text, kind=self._task.level)
+        return drawings.levels_from_text(text, kind=self._task.level)
 
     def write_file(self, name: str, level: Level) -> str:
         """Returns a file's text; docs/how_to/levels.md has the format."""
-        return level_files.levels_to_text({name: level})
+        return drawings.levels_to_text({name: level})
 
 
 class MazeBoard(Drawings):
@@ -98,8 +96,6 @@ class MazeBoard(Drawings):
         copies = planes(level.expand(agent.copies, 1))
         logits, values = (each[solver, 0] for each in cell_maps(agent, copies))
         logits, values = logits.float(), values[0].float()
-        if not (logits.isfinite().all() and values.isfinite().all()):
-            raise ValueError("the Solver of this checkpoint answers with NaN or infinity")
         policy = logits.softmax(0)
         visits = evaluation.expected_visits(level, policy, limit)
         results = evaluation.ExactEvaluator(limit, step_penalty)(level, logits)

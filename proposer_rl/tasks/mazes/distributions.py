@@ -91,15 +91,15 @@ class SpecificationSpace(LevelDistribution):
     Number ``i * N + j`` stands for ``(obstacle_fractions[i], path_lengths[j])``.
 
     Args:
-        obstacle_fractions: M distinct fractions in [0, 1).
-        path_lengths: N distinct numbers of moves.
+        obstacle_fractions: M fractions in [0, 1).
+        path_lengths: N numbers of moves.
         mechanism, height, width, device: As in :class:`LevelDistribution`.
 
     Attributes:
         axes: The M fractions and N lengths, by name.
 
     Raises:
-        ValueError: If an entry is repeated or a specification cannot be met.
+        ValueError: If a specification cannot be met.
 
     Example:
         >>> space = SpecificationSpace((0.0, 0.2), (2, 4, 6), height=6, width=6)
@@ -118,10 +118,6 @@ class SpecificationSpace(LevelDistribution):
         width: int = 10,
         device: torch.device | str = "cpu",
     ) -> None:
-        axes = {"obstacle_fractions": obstacle_fractions, "path_lengths": path_lengths}
-        for name, values in axes.items():
-            if len(set(values)) < len(values):
-                raise ValueError(f"{name} must be distinct, got {list(values)}")
         self.axes: dict[str, Sequence[float]] = {
             "obstacle fraction": tuple(obstacle_fractions),
             "path length": tuple(path_lengths),

@@ -105,17 +105,15 @@ def _specifications(
     if isinstance(obstacle_fraction, Tensor):
         obstacle_fraction = obstacle_fraction.detach().cpu()
     fraction = torch.as_tensor(obstacle_fraction, dtype=torch.float64)
-    length = torch.as_tensor(path_length).cpu()
-    if length.is_floating_point() or length.dtype == torch.bool:
-        raise ValueError(f"path_length must hold whole numbers, got {length.dtype}")
-    fraction, length = torch.broadcast_tensors(fraction, length.long())
-    bad = ~((fraction >= 0) & (fraction < 1) & (length >= 1))
+    fraction, length = torch.broadcast_tensors(fraction, torch.as_tensor(path_length).cpu())
+    whole = length.long()
+    bad = ~((fraction >= 0) & (fraction < 1) & (length >= 1) & (length == whole))
     if bad.any():
         raise ValueError(
             f"obstacle_fraction={fraction[bad][0]:g} must be at least 0 and below 1, "
-            f"path_length={length[bad][0]} at least 1"
+            f"path_length={length[bad][0]:g} a whole number of at least 1"
         )
-    return fraction, length
+    return fraction, whole
 
 
 class _Task:

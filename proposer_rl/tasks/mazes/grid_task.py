@@ -16,10 +16,9 @@ from torch import Tensor
 from proposer_rl.learning import SolverSettings, first_episode_success
 from proposer_rl.models import ActorCritic, MapEncoder
 from proposer_rl.task import Board, ComputeContext, LevelResult, Task, check_distributions, named
+from proposer_rl.tasks.mazes.drawings import SETS, SUFFIXES, level_records, read_levels
 from proposer_rl.tasks.mazes.generation import edit_levels
-from proposer_rl.tasks.mazes.level_files import shipped_levels, shipped_sets
 from proposer_rl.tasks.mazes.levels import Level, shortest_path_length
-from proposer_rl.tasks.mazes.rendering import level_records
 
 STEPS_PER_SHORTEST = 2  # of a named level: steps allowed for each one of its shortest way
 _ON_A_GRID = re.compile(r"(.+?)(?:@(\d{1,3})x(\d{1,3}))?")
@@ -40,8 +39,6 @@ class GridTask(Task):
 
     Attributes:
         level: class of the levels.
-        suffixes: of files of levels.
-        read_file: reads such a file: levels [] by their names.
         fewest_steps: of a shortest way to the goal of levels [*B]: int64 [*B], -1 for none.
         probe_planes: of a probe.
         steps_name: what the steps of a shortest way are called in results.
@@ -55,8 +52,6 @@ class GridTask(Task):
     noun = "mazes"
     key = "Blue: start. Orange: goal. Purple: the Solver's first episode there."
     level: ClassVar[type[Level]] = Level
-    suffixes: ClassVar[Sequence[str]]
-    read_file: Callable[[str], Mapping[str, Any]]
     fewest_steps: Callable[[Any], Tensor]
     probe_planes: ClassVar[int]
     steps_name: ClassVar[str]
@@ -238,8 +233,8 @@ class GridTask(Task):
             ValueError: if there are no such levels.
             StorageError: if a file cannot be read.
         """
-        if Path(name).suffix in self.suffixes:
-            return dict(self.read_file(name)), STEPS_PER_SHORTEST
+        if name in SETS or Path(name).suffix in SUFFIXES:
+            return read_levels(SETS.get(name, name), self.level), STEPS_PER_SHORTEST
         asked = _ON_A_GRID.fullmatch(name)
         for known, kind in self._kinds.items():
             if asked is None or known.casefold() != asked[1].casefold():
@@ -253,11 +248,9 @@ class GridTask(Task):
                 grid = named(f"--levels {known}", self.make_distribution, kind, *size)
                 levels = grid.sample(self._levels, self.stream("levels", known))
             return {f"{known}_{i:03}": levels[i].cpu() for i in range(len(levels))}, 0
-        if name in shipped_sets():
-            return dict(shipped_levels(name, self.level)), STEPS_PER_SHORTEST
         raise ValueError(
-            f"--levels {name}: must be one of: {', '.join(shipped_sets())}, a file that ends in "
-            f"{' or '.join(self.suffixes)}, or a distribution: {', '.join(self._kinds)}, as it is "
+            f"--levels {name}: must be one of: {', '.join(SETS)}, a file that ends in "
+            f"{' or '.join(SUFFIXES)}, or a distribution: {', '.join(self._kinds)}, as it is "
             f"or on another grid as in {self._target}@13x13"
         )
 

@@ -85,7 +85,7 @@ class Level(TensorClass):
         ends = sorted(flat.replace(WALL, "").replace(FREE, ""))
         if len({*map(len, rows)}) != 1 or ends != sorted([START, GOAL]):
             raise ValueError(
-                f"a level is a rectangle of '#' and '.', with one 'S' and one 'G', got\n{drawing}"
+                f"a level is a rectangle of '#' and '.', with one 'S' and one 'G', got {rows!r:.99}"
             )
         width = len(rows[0])
         return Level(

@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 
 from proposer_rl.models import check_torch_defaults, population
 from proposer_rl.settings import signed
+from proposer_rl.tasks.mazes.drawings import draw_level
 from proposer_rl.tasks.mazes.levels import (
     MOVES,
     Level,
@@ -23,7 +24,6 @@ from proposer_rl.tasks.mazes.levels import (
     planes,
     successors,
 )
-from proposer_rl.tasks.mazes.rendering import draw_level
 
 END_KEYS = ("done", "terminated", "truncated")
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge, Interval, Len
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning import SolverSettings
-from proposer_rl.models import ActorCritic, Population, cell_logits, map_actor_critic
+from proposer_rl.models import ActorCritic, Population, UNet, cell_logits, map_actor_critic
+from proposer_rl.settings import settings
 from proposer_rl.task import ComputeContext, LevelResult, for_copies
 from proposer_rl.tasks.mazes.board import MazeBoard
 from proposer_rl.tasks.mazes.distributions import LevelDistribution, SpecificationSpace
+from proposer_rl.tasks.mazes.drawings import EPISODE
 from proposer_rl.tasks.mazes.evaluation import (
     ExactEvaluator,
     RolloutEvaluator,
@@ -21,26 +25,90 @@ from proposer_rl.tasks.mazes.evaluation import (
     worst_mean,
 )
 from proposer_rl.tasks.mazes.grid_task import GridTask
-from proposer_rl.tasks.mazes.level_files import RECORD, SUFFIXES, read_levels
 from proposer_rl.tasks.mazes.levels import Level, planes, shortest_path_length
 from proposer_rl.tasks.mazes.maze_env import MazeEnv
-from proposer_rl.tasks.mazes.maze_settings import (
-    ACTIONS,
-    PLANES,
-    Channels,
-    DistributionSettings,
-    MazeEvaluationSettings,
-    MazeSettings,
-    SpaceSettings,
-    UNetSettings,
-    check_grid,
-    faster_precision,
-    unet,
-)
-from proposer_rl.tasks.mazes.rendering import EPISODE
 
+ACTIONS = 4
+PLANES = 3
 WORST = 0.1  # of the levels, in <name>_success_worst10
 CELLS_AT_ONCE = 2**17  # that go through the network together
+
+Mechanism = Literal["uniform", "path_first"]
+Fraction = Annotated[float, Interval(ge=0, lt=1)]
+PathLength = Annotated[int, Ge(1)]
+Fractions = Fraction | Annotated[list[Fraction], Len(1)]
+PathLengths = PathLength | Annotated[list[PathLength], Len(1)]
+Channels = Annotated[list[Annotated[int, Ge(1)]], Len(1)]
+
+
+@settings
+class MazeSettings:
+    """The inner environment.
+
+    Attributes:
+        height, width: the grid, in cells.
+        max_steps: steps after which an episode is truncated.
+        step_penalty: what every step costs.
+        observe_agent: draw the agent on a fourth plane; then every step needs its own forward pass.
+    """
+
+    height: Annotated[int, Interval(ge=1, le=1000)] = 10
+    width: Annotated[int, Interval(ge=1, le=1000)] = 10
+    max_steps: Annotated[int, Ge(1)] = 25
+    step_penalty: Annotated[float, Ge(0)] = 0.01
+    observe_agent: bool = False
+
+
+@settings
+class DistributionSettings:
+    """Levels drawn uniformly from (obstacle fraction, path length) pairs, by one mechanism."""
+
+    specifications: Annotated[list[tuple[Fraction, PathLength]], Len(1)]
+    mechanism: Mechanism = "uniform"
+
+
+@settings
+class SpaceSettings:
+    """The Proposer's bins: every obstacle fraction with every path length."""
+
+    obstacle_fractions: Annotated[list[Fraction], Len(1)]
+    path_lengths: Annotated[list[PathLength], Len(1)]
+    mechanism: Mechanism = "uniform"
+
+
+@settings
+class UNetSettings:
+    """The Solver's U-Net.
+
+    Attributes:
+        channels: of each resolution, finest first.
+        groups: of every GroupNorm; divides each of the channels.
+        policy_gain, value_gain: gains of the heads' orthogonal initialisation.
+    """
+
+    channels: Channels
+    groups: Annotated[int, Ge(1)] = 8
+    policy_gain: Annotated[float, Ge(0)] = 0.01
+    value_gain: Annotated[float, Ge(0)] = 1.0
+
+
+@settings
+class MazeEvaluationSettings:
+    """Settings of how the Solver is measured, apart from its training.
+
+    Attributes:
+        distributions: names of the distributions that are measured on.
+        levels: number of levels of each distribution, the same in every run.
+        seed: from which they are drawn.
+        evaluator: of the Proposer's validation levels: exact, or Monte-Carlo episodes.
+        episodes: Monte-Carlo episodes per level.
+    """
+
+    distributions: Annotated[list[str], Len(1)]
+    levels: Annotated[int, Ge(1)] = 512
+    seed: Annotated[int, Ge(0)] = 0
+    evaluator: Literal["exact", "rollout"] = "exact"
+    episodes: Annotated[int, Ge(1)] = 1
 
 
 class MazeTask(GridTask):
@@ -59,8 +127,6 @@ class MazeTask(GridTask):
     """
 
     exact_metrics = True  # whatever the evaluator of the Proposer's reward is
-    suffixes = (*SUFFIXES, RECORD)
-    read_file = staticmethod(read_levels)
     fewest_steps = staticmethod(shortest_path_length)
     probe_planes = PLANES + ACTIONS
     steps_name = "path_length"
@@ -242,3 +308,44 @@ def _with_logits(agent: ActorCritic, levels: Level) -> tuple[Level, Tensor]:
     """Returns levels [E] or [K, E] as [K, E], and the K Solvers' logits at every cell."""
     copies = for_copies(agent, levels)
     return copies, cell_logits(agent, planes(copies))
+
+
+def unet(network: UNetSettings, planes: int) -> UNet:
+    """Returns the U-Net of one Solver, which sees so many planes."""
+    return UNet(
+        in_channels=planes,
+        head_channels=(ACTIONS, 1),
+        channels=network.channels,
+        groups=network.groups,
+        head_gains=(network.policy_gain, network.value_gain),
+    )
+
+
+def faster_precision(channels: Sequence[int], device: torch.device) -> str:
+    """Returns ``"bf16"`` where it was measured to be faster and to learn alike, else ``"fp32"``.
+
+    That is a wide network on a CPU with instructions for it; see docs/explanation/performance.md.
+
+    Args:
+        channels: of the Solver's network.
+        device: that it runs on.
+    """
+    in_hardware = device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
+    return "bf16" if in_hardware and channels[0] >= 64 else "fp32"
+
+
+def check_grid(what: str, size: Sequence[int], network: UNetSettings) -> None:
+    """Refuses a grid that the U-Net of the settings halves to nothing, or to single numbers.
+
+    Of those GroupNorm makes zeros.
+    """
+    height, width = size
+    if any(
+        (height >> halvings) * (width >> halvings) * channels <= network.groups
+        for halvings, channels in enumerate(network.channels)
+    ):
+        raise ValueError(
+            f"{what}: {height}x{width} cells are too few for this Solver: with "
+            f"network.channels={network.channels} and network.groups={network.groups} a group of "
+            "channels is left with one number or none"
+        )

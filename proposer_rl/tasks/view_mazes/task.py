@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import scipy
 import torch
@@ -16,23 +16,36 @@ from proposer_rl.learning import SolverSettings, mean_performance
 from proposer_rl.models import ActorCritic, MemoryNetwork
 from proposer_rl.settings import settings
 from proposer_rl.streams import Streams
-from proposer_rl.task import ComputeContext, LevelResult, for_copies
+from proposer_rl.task import CellKind, ComputeContext, LevelResult, for_copies
+from proposer_rl.tasks.mazes.board import Drawings
 from proposer_rl.tasks.mazes.grid_task import GridTask
-from proposer_rl.tasks.mazes.levels import planes
-from proposer_rl.tasks.mazes.maze_settings import Channels
+from proposer_rl.tasks.mazes.levels import (
+    FREE,
+    GOAL,
+    MOVES,
+    WALL,
+    cell_index,
+    planes,
+    shortest_way,
+    successors,
+)
+from proposer_rl.tasks.mazes.task import Channels
 from proposer_rl.tasks.view_mazes import view_env
-from proposer_rl.tasks.view_mazes.board import ViewBoard
-from proposer_rl.tasks.view_mazes.view_distributions import (
+from proposer_rl.tasks.view_mazes.view_env import PENALTY, ViewMazeEnv, ViewNetworkSettings
+from proposer_rl.tasks.view_mazes.view_levels import (
+    AGENTS,
+    AHEAD,
     ViewDistribution,
     ViewDistributionSettings,
+    ViewLevel,
     ViewSpace,
     ViewSpaceSettings,
 )
-from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv, ViewNetworkSettings
-from proposer_rl.tasks.view_mazes.view_levels import VIEW_SUFFIXES, ViewLevel, read_view_levels
 
 LOCATING = 4096  # levels by which the target is located among the bins
 EPISODES_AT_ONCE = 4096  # that are played together on named levels
+SHOWN = 20  # sampled episodes that can be watched
+Node = list[int]  # row, column and direction
 
 
 @settings
@@ -44,8 +57,8 @@ class ViewMazeSettings:
         max_steps: steps after which an episode is truncated.
     """
 
-    height: Annotated[int, Ge(2), Le(100)] = 13
-    width: Annotated[int, Ge(2), Le(100)] = 13
+    height: Annotated[int, Ge(3), Le(100)] = 13
+    width: Annotated[int, Ge(3), Le(100)] = 13
     max_steps: Annotated[int, Ge(1)] = 250
 
 
@@ -83,8 +96,6 @@ class ViewMazeTask(GridTask):
     """
 
     level = ViewLevel
-    suffixes = VIEW_SUFFIXES
-    read_file = staticmethod(read_view_levels)
     fewest_steps = staticmethod(view_env.fewest_actions)
     probe_planes = 4  # walls, start, goal, and where the Solver goes
     steps_name = "fewest_actions"
@@ -189,3 +200,79 @@ class ViewMazeTask(GridTask):
                     "return": float(performance["return"][k, i]),
                 }
                 yield LevelResult(name, k, known, results)
+
+
+class ViewBoard(Drawings):
+    """Mazes seen through a window; a :class:`~proposer_rl.task.Board` without policy and maps.
+
+    What a Solver does in a cell depends on what it remembers, so that only episodes can be shown.
+
+    Args:
+        task: whose levels are drawn.
+        episodes: played on a level to measure a Solver.
+        streams: that actions are drawn from, as ``bin/eval`` draws them.
+    """
+
+    kinds = (
+        CellKind(FREE, "free"),
+        CellKind(WALL, "wall"),
+        *(CellKind(mark, "start", once=True) for mark in AGENTS),
+        CellKind(GOAL, "goal", once=True),
+    )
+    actions = ("left", "right", "up")  # two turns, and forward
+
+    def __init__(self, task: GridTask, episodes: int, streams: Streams) -> None:
+        super().__init__(task)
+        self._episodes, self._streams = episodes, streams
+
+    def examine(
+        self, agent: ActorCritic, solver: int, level: ViewLevel, max_steps: int | None
+    ) -> dict[str, Any]:
+        """Returns what a Solver does on a level, by playing; see :class:`~proposer_rl.task.Board`.
+
+        ``results``: means over sampled episodes, those of ``bin/eval`` on a level named ``drawn``.
+        """
+        limit = max_steps or self._task.step_limit(int(view_env.fewest_actions(level)))
+        goal, following = level.goal.tolist(), _following(level)
+        placed = level.to(self._task.device).expand(self._episodes)
+        generator = self._streams.generator("drawn")
+        noise = torch.rand(limit, self._episodes, generator=generator).to(self._task.device)
+        went, steps = (each[solver] for each in view_env.walks(agent, placed, limit, noise))
+        best, number = (each[solver, 0] for each in view_env.walks(agent, placed[:1], limit))
+        sampled = [one[: n + 1].tolist() for one, n in zip(went, steps.tolist(), strict=True)]
+        reached = [path[-1][:2] == goal for path in sampled]
+        moves = [len(path) - 1 for path in sampled]
+        returns = [r * (1 - PENALTY / limit * n) for r, n in zip(reached, moves, strict=True)]
+        results = {"success": reached, "return": returns, "steps": moves}
+        return {
+            "results": {name: sum(each) / self._episodes for name, each in results.items()},
+            "episodes": self._episodes,
+            "maps": {},
+            "paths": {
+                "solver": best[: int(number) + 1].tolist(),
+                "shortest": _shortest(level, following),
+                "sampled": sampled[:SHOWN],
+            },
+            "next": following,
+            "goal": goal,
+            "max_steps": limit,
+            "step_penalty": PENALTY / limit,
+            "missed": 0.0,
+        }
+
+
+def _following(level: ViewLevel) -> list[list[int]]:
+    """Returns where each action leads, [3][H * W * 4]; four directions for each cell."""
+    moved = successors(level).tolist()  # [4][H * W], in the order of MOVES
+    ahead = [moved[MOVES.index(step)] for step in AHEAD]
+    cells, ways = range(len(moved[0])), range(len(AHEAD))
+    turned = [[4 * cell + (way + turn) % 4 for cell in cells for way in ways] for turn in (-1, 1)]
+    return [*turned, [4 * ahead[way][cell] + way for cell in cells for way in ways]]
+
+
+def _shortest(level: ViewLevel, following: list[list[int]]) -> list[Node] | None:
+    """Returns a way of fewest actions, start and goal included; None where there is none."""
+    width = level.walls.shape[1]
+    start, goal = (int(cell_index(cell, width)) for cell in (level.start, level.goal))
+    way = shortest_way(following, 4 * start + int(level.direction), lambda n: n // 4 == goal)
+    return None if way is None else [[*divmod(node // 4, width), node % 4] for node in way]

@@ -17,17 +17,12 @@ from proposer_rl.models import ActorCritic, MemoryNetwork
 from proposer_rl.settings import settings, signed
 from proposer_rl.tasks.mazes.levels import STEPS_BETWEEN_CHECKS, cell_index, cell_plane
 from proposer_rl.tasks.mazes.maze_env import LevelEnv
-from proposer_rl.tasks.view_mazes.view_levels import (
-    AHEAD,
-    EMPTY_OBJECT,
-    GOAL_OBJECT,
-    WALL_OBJECT,
-    ViewLevel,
-)
+from proposer_rl.tasks.view_mazes.view_levels import AHEAD, ViewLevel
 
 VIEW_ACTIONS = 3
 LEFT, RIGHT, FORWARD = range(VIEW_ACTIONS)
 
+EMPTY_OBJECT, WALL_OBJECT, GOAL_OBJECT = 1, 2, 8  # MiniGrid's numbers
 VIEW = 5  # cells on a side of what is seen
 RIM = VIEW - 1  # of walls around the grid, so that all that is seen is in memory
 AGENT_PLACE = (VIEW // 2, VIEW - 1)  # where the agent is in its view
@@ -56,9 +51,6 @@ class ViewMazeEnv(LevelEnv):
     Args:
         levels: As of :class:`~proposer_rl.tasks.mazes.maze_env.LevelEnv`.
         max_steps: Step limit of an episode.
-
-    Raises:
-        ValueError: If ``max_steps`` is less than 1.
 
     Example:
         >>> env = ViewMazeEnv(ViewLevel.from_text("^.G"))

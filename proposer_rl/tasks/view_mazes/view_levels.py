@@ -1,23 +1,22 @@
-"""Levels in which an agent looks in a direction, and the files that users have of them."""
+"""Levels in which an agent looks in a direction, and distributions of them.
+
+Drawn levels ``[N]`` are on the CPU, with height x width cells; so is the generator ``draw``.
+"""
 
 from __future__ import annotations
 
-import ast
-import io
-import json
-import os
-from collections.abc import Iterator, Mapping
-from pathlib import Path
-from typing import Any, cast
+import math
+from collections.abc import Callable, Sequence
+from itertools import product
+from typing import Annotated, Any, Literal
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
+from annotated_types import Ge, Len
 from torch import Tensor
 
-from proposer_rl.runs.folder import read_bounded
-from proposer_rl.tasks.mazes import level_files
-from proposer_rl.tasks.mazes.levels import FREE, GOAL, START, WALL, Level, drawn_rows
+from proposer_rl.settings import BY_KIND, settings
+from proposer_rl.tasks.mazes.generation import generate_levels
+from proposer_rl.tasks.mazes.levels import START, Level, cell_position, shortest_path_length
 
 AGENTS = (">", "v", "<", "^")
 """The agent in a drawing, by its direction: 0 right, 1 down, 2 left, 3 up."""
@@ -25,11 +24,8 @@ AGENTS = (">", "v", "<", "^")
 AHEAD = ((0, 1), (1, 0), (0, -1), (-1, 0))
 """Change of row and column on moving forward, by direction."""
 
-VIEW_SUFFIXES = (".txt", ".json", level_files.RECORD, ".py", ".npy")
-EMPTY_OBJECT, WALL_OBJECT, FLOOR_OBJECT, GOAL_OBJECT, AGENT_OBJECT = 1, 2, 3, 8, 10
-"""Objects by MiniGrid's numbers."""
-
-OBJECT_MARKS = {EMPTY_OBJECT: FREE, FLOOR_OBJECT: FREE, WALL_OBJECT: WALL, GOAL_OBJECT: GOAL}
+ENDPOINTS = 2  # cells that are no walls: start and goal
+Walls = Annotated[int, Ge(0)]
 
 
 class ViewLevel(Level):
@@ -81,103 +77,291 @@ def directed(level: Level, direction: Tensor) -> ViewLevel:
     )
 
 
-def read_view_levels(path: str | os.PathLike[str]) -> dict[str, ViewLevel]:
-    """Reads a file of levels; nothing in it is executed.
+@settings
+class ScatteredSettings:
+    """Walls anywhere; each number of them from ``fewest`` to ``most`` is equally likely.
 
-    - ``.txt``, ``.json`` and a run's ``curriculum.jsonl``: as
-      :func:`~proposer_rl.tasks.mazes.level_files.read_levels`; the start is one of ``>``, ``v``,
-      ``<``
-      and ``^``, or an ``S`` that looks to the right. A single drawing of jaxued's is such a file.
-    - ``.py``: a module such as jaxued's ``environments/maze/level.py``: every text in it that is
-      assigned to a name and drawn like that is a level of this name.
-    - ``.npy``, or a list in ``.json``: MiniGrid's encoding of one grid, [W, H, 3], or of several of
-      one size, [n, W, H, 3], with the agent in it, as ``FullyObsWrapper`` has it. A border of walls
-      is left out.
+    Attributes:
+        solvable: whether levels are drawn again whose goal cannot be reached.
+    """
 
-    Returns:
-        Levels of batch shape ``[]`` by their names, in the file's order.
+    kind: Literal["scattered"] = "scattered"
+    fewest: Walls = 0
+    most: Walls = 60
+    solvable: bool = False
+
+
+@settings
+class PerfectSettings:
+    """Mazes with one way between any two cells."""
+
+    kind: Literal["perfect"] = "perfect"
+
+
+@settings
+class RoomsSettings:
+    """Four rooms with a door between any two neighbours."""
+
+    kind: Literal["four_rooms"] = "four_rooms"
+
+
+ViewDistributionSettings = Annotated[ScatteredSettings | PerfectSettings | RoomsSettings, BY_KIND]
+
+
+@settings
+class ViewSpaceSettings:
+    """The Proposer's bins.
+
+    Attributes:
+        walls: numbers of walls.
+        path_lengths: moves on the shortest path, each with each of the numbers; None for start and
+            goal anywhere, as in the field.
+    """
+
+    walls: Annotated[list[Walls], Len(1)]
+    path_lengths: Annotated[list[Annotated[int, Ge(1)]], Len(1)] | None = None
+
+
+class ViewDistribution:
+    """Levels of one kind.
+
+    Args:
+        settings: the kind.
+        height, width: of the grid.
+        device: where the levels are returned.
 
     Raises:
-        ValueError: If the file holds something else; the message names the file.
-        StorageError: If it cannot be read.
+        ValueError: if there are no such levels on this grid.
     """
-    path = Path(path)
-    level_files.check_suffix(path, VIEW_SUFFIXES)
-    content = read_bounded(path, level_files.LARGEST_FILE_BYTES)
-    a_list = path.suffix == ".json" and content.lstrip().startswith(b"[")
-    encoded = a_list or path.suffix == ".npy"
-    if not encoded and path.suffix != ".py":
-        return cast(dict[str, ViewLevel], level_files.read_levels(path, ViewLevel))
-    try:
-        drawn = _encoded(content, path) if encoded else _assigned(content)
-        named = [(name, rows, None) for name, rows in drawn.items()]
-        return cast(dict[str, ViewLevel], level_files.named_levels(named, ViewLevel))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+
+    def __init__(
+        self, settings: ViewDistributionSettings, height: int, width: int, device: torch.device
+    ) -> None:
+        if isinstance(settings, ScatteredSettings):
+            _check_walls(settings.most, height, width)
+        self._settings, self._grid, self._device = settings, (height, width), device
+        self.sample(1, torch.Generator().manual_seed(0))
+
+    def sample(self, count: int, generator: torch.Generator) -> ViewLevel:
+        """Draws levels [count]; the generator is one of the CPU."""
+        return self._draw(count, generator).to(self._device)
+
+    def _draw(self, count: int, generator: torch.Generator) -> ViewLevel:
+        settings = self._settings
+        if isinstance(settings, PerfectSettings):
+            return perfect_mazes(count, *self._grid, generator)
+        if isinstance(settings, RoomsSettings):
+            return four_rooms(count, *self._grid, generator)
+
+        def scattered(number: int) -> ViewLevel:
+            ends = (settings.fewest, settings.most + 1)
+            walls = torch.randint(*ends, (number,), generator=generator)
+            return scattered_walls(walls, *self._grid, generator)
+
+        return solvable(scattered, count) if settings.solvable else scattered(count)
+
+    def __str__(self) -> str:
+        kind = self._settings
+        if not isinstance(kind, ScatteredSettings):
+            return kind.kind.replace("_", " ")
+        solvable = ", solvable" if kind.solvable else ""
+        return f"{kind.fewest} to {kind.most} walls anywhere{solvable}"
 
 
-def _assigned(content: bytes) -> dict[str, list[str]]:
-    """Reads the drawings that a module assigns to names, as rows."""
-    try:
-        body = ast.parse(content).body
-    except SyntaxError:
-        raise ValueError("is no Python module") from None
-    return {
-        target.id: drawn_rows(statement.value.value)
-        for statement in body
-        if isinstance(statement, ast.Assign | ast.AnnAssign)
-        and isinstance(statement.value, ast.Constant)
-        and isinstance(statement.value.value, str)
-        and _is_drawing(statement.value.value)
-        for target in getattr(statement, "targets", [getattr(statement, "target", None)])
-        if isinstance(target, ast.Name)
-    }
+class ViewSpace:
+    """Bins of levels: every number of walls, or each of these with every length of the path.
+
+    Without lengths start and goal are anywhere, and may have no path between them: levels drawn
+    uniformly from all bins are domain randomization as in PLR, ACCEL and SFL. With lengths every
+    level has a shortest path of exactly so many moves.
+
+    Args:
+        settings: numbers and lengths.
+        height, width: of the grid.
+        device: where the levels are returned.
+
+    Attributes:
+        axes: the values along each axis, by name.
+        size: number N of bins.
+        coordinates: of each bin, scaled to [-1, 1] along every axis, 0 where it has one value,
+            float32 [N, D].
+
+    Raises:
+        ValueError: if there are no levels of a bin.
+    """
+
+    def __init__(
+        self, settings: ViewSpaceSettings, height: int, width: int, device: torch.device
+    ) -> None:
+        self.axes: dict[str, Sequence[float]] = {"walls": tuple(settings.walls)}
+        if settings.path_lengths is not None:
+            self.axes["path length"] = tuple(settings.path_lengths)
+        _check_walls(max(settings.walls), height, width)
+        self._grid, self._device = (height, width), device
+        self._values = torch.tensor(list(product(*self.axes.values())))  # int64 [N, D]
+        self.size = len(self._values)
+        middle = (self._values.amax(0) + self._values.amin(0)) / 2
+        self._middle, self._reach = middle, (self._values.amax(0) - middle).clamp(min=0.5)
+        self.coordinates = self._scaled(self._values)
+        self.generate(torch.arange(self.size).unsqueeze(0), [torch.Generator().manual_seed(0)])
+
+    def sample(self, count: int, generator: torch.Generator) -> ViewLevel:
+        """Draws levels [count] uniformly from the bins."""
+        choices = torch.randint(self.size, (1, count), generator=generator)
+        return self.generate(choices, [generator])[0]
+
+    def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> ViewLevel:
+        """Draws levels [K, P] of bins, int64 [K, P]; row k by generator k."""
+        pairs = zip(choices.cpu(), generators, strict=True)
+        levels = [self._generate(self._values[index], draw) for index, draw in pairs]
+        return torch.stack(levels).to(self._device)  # type: ignore[arg-type, return-value]
+
+    def locate(self, levels: ViewLevel) -> Tensor:
+        """Returns where levels [*B] lie, as the coordinates: float32 [*B, D] on the CPU.
+
+        A goal that cannot be reached counts as far away as there are cells.
+        """
+        counts = self._counts(levels)
+        return self._scaled(counts.where(counts >= 0, math.prod(self._grid)))
+
+    def shares(self, levels: ViewLevel) -> Tensor:
+        """Returns the share of levels [n] nearest to each bin, float32 [N], of solvable ones.
+
+        Without lengths all of the levels count.
+        """
+        counts = self._counts(levels)
+        distance = torch.cdist(self._scaled(counts), self.coordinates)
+        nearest = distance.argmin(1)[counts[:, -1] >= 0]
+        return nearest.bincount(minlength=self.size) / len(nearest)
+
+    def _counts(self, levels: ViewLevel) -> Tensor:
+        """Returns levels' walls, and path lengths (-1 for none) if an axis: int64 [*B, D]."""
+        counts = [levels.walls.flatten(-2).sum(-1)]
+        if "path length" in self.axes:
+            counts.append(shortest_path_length(levels))
+        return torch.stack(counts, -1).cpu()
+
+    def _scaled(self, values: Tensor) -> Tensor:
+        return (values - self._middle) / self._reach
+
+    def _generate(self, values: Tensor, draw: torch.Generator) -> ViewLevel:
+        walls = values[:, 0]
+        if values.shape[1] == 1:
+            return scattered_walls(walls, *self._grid, draw)
+        fraction = walls.double() / math.prod(self._grid)
+        levels = generate_levels(fraction, values[:, 1], *self._grid, generator=draw)
+        return directed(levels, torch.randint(len(AHEAD), (len(walls),), generator=draw))
 
 
-def _is_drawing(text: str) -> bool:
-    marks = set("".join(text.split()))
-    return (
-        GOAL in marks and bool(marks & set(AGENTS)) and marks <= {*AGENTS, *OBJECT_MARKS.values()}
+def _check_walls(most: int, height: int, width: int) -> None:
+    if most > height * width - ENDPOINTS:
+        raise ValueError(
+            f"{height}x{width} cells have at most {height * width - ENDPOINTS} walls beside "
+            f"start and goal, got {most}"
+        )
+
+
+MOST_DRAWS = 1000  # of a level whose goal is to be reachable
+
+
+def scattered_walls(count: Tensor, height: int, width: int, draw: torch.Generator) -> ViewLevel:
+    """Draws levels with exact numbers of walls; all cells and the direction are uniform.
+
+    Nothing else is asked of them: the goal may be out of reach, as in PLR's and jaxued's. The
+    numbers are int64 ``[N]`` on the CPU, at most height * width - 2.
+    """
+    order = torch.rand(len(count), height * width, generator=draw).argsort(1)
+    # The first two cells of a random order are start and goal, the next ones walls.
+    wall = torch.arange(height * width) < count.unsqueeze(1) + 2
+    walls = torch.zeros_like(wall).scatter(1, order, wall)
+    walls.scatter_(1, order[:, :2], False)
+    return _level_of(walls.unflatten(1, (height, width)), order[:, :2], draw)
+
+
+def perfect_mazes(number: int, height: int, width: int, draw: torch.Generator) -> ViewLevel:
+    """Draws mazes with one path between any two free cells, by a random depth-first search.
+
+    The cells of even row and column are all free; the search opens the cells between them. Start,
+    goal and direction are uniform.
+
+    Raises:
+        ValueError: If a side is even.
+    """
+    if height % 2 == 0 or width % 2 == 0:
+        raise ValueError(f"perfect mazes have odd sides, got {height}x{width}")
+    rows, columns = height // 2 + 1, width // 2 + 1
+    levels = torch.arange(number)
+    step = torch.tensor(AHEAD)  # [4, 2]
+    new = torch.ones(number, rows + 2, columns + 2, dtype=torch.bool)  # with a rim that is not new
+    new[:, [0, -1]], new[:, :, [0, -1]] = False, False
+    free = torch.zeros(number, height, width, dtype=torch.bool)
+    first = [torch.randint(1, side + 1, (number,), generator=draw) for side in (rows, columns)]
+    here = torch.stack(first, 1)
+    trail = torch.empty(rows * columns, number, 2, dtype=torch.int64)  # from the first cell to here
+    depth = torch.zeros(number, dtype=torch.int64)
+    new[levels, here[:, 0], here[:, 1]] = False
+    free[:, ::2, ::2] = True
+    # Every cell is entered once and left once.
+    for _ in range(2 * rows * columns - 2):
+        beside = here.unsqueeze(1) + step  # [N, 4, 2]
+        open_ = new[levels.unsqueeze(1), beside[..., 0], beside[..., 1]]
+        chance = torch.rand(number, len(AHEAD), generator=draw)
+        moved = step[chance.where(open_, -1.0).argmax(1)]
+        on = open_.any(1)
+        trail[depth, levels] = here
+        depth = torch.where(on, depth + 1, (depth - 1).clamp(min=0))
+        there = torch.where(on.unsqueeze(1), here + moved, trail[depth, levels])
+        between = 2 * here - 2 + moved * on.unsqueeze(1)
+        free[levels, between[:, 0], between[:, 1]] = True
+        new[levels, there[:, 0], there[:, 1]] = False
+        here = there
+    return _placed(~free, draw)
+
+
+def four_rooms(number: int, height: int, width: int, draw: torch.Generator) -> ViewLevel:
+    """Draws four rooms around a cross of walls, each of whose arms has a random door.
+
+    Start, goal and direction are uniform; a side has at least 3 cells.
+    """
+    middle = (height // 2, width // 2)
+    walls = torch.zeros(number, height, width, dtype=torch.bool)
+    walls[:, middle[0]], walls[:, :, middle[1]] = True, True
+    levels = torch.arange(number)
+    for arm, first, last in (
+        (walls[:, middle[0]], 0, middle[1]),
+        (walls[:, middle[0]], middle[1] + 1, width),
+        (walls[:, :, middle[1]], 0, middle[0]),
+        (walls[:, :, middle[1]], middle[0] + 1, height),
+    ):
+        arm[levels, torch.randint(first, last, (number,), generator=draw)] = False
+    return _placed(walls, draw)
+
+
+def solvable(draw_levels: Callable[[int], ViewLevel], number: int) -> ViewLevel:
+    """Draws levels until the goal of each can be reached."""
+    levels = draw_levels(number)
+    for _ in range(MOST_DRAWS):
+        bad = (shortest_path_length(levels) < 0).nonzero().squeeze(1)
+        if not len(bad):
+            return levels
+        levels[bad] = draw_levels(len(bad))
+    raise ValueError(f"in {MOST_DRAWS} draws of a level its goal could not be reached")
+
+
+def _placed(walls: Tensor, draw: torch.Generator) -> ViewLevel:
+    """Returns levels of walls [N, H, W] with different uniform free cells as start and goal."""
+    chance = torch.rand(walls.flatten(1).shape, generator=draw)
+    ends = chance.where(~walls.flatten(1), -1.0).topk(2, 1).indices
+    return _level_of(walls, ends, draw)
+
+
+def _level_of(walls: Tensor, ends: Tensor, draw: torch.Generator) -> ViewLevel:
+    """Returns levels of walls [N, H, W] and ends [N, 2], start and goal, in random directions."""
+    start, goal = cell_position(ends, walls.shape[-1]).unbind(1)
+    return ViewLevel(
+        walls=walls,
+        start=start,
+        goal=goal,
+        direction=torch.randint(len(AHEAD), (len(walls),), generator=draw),
+        batch_size=[len(walls)],
     )
-
-
-def _encoded(content: bytes, path: Path) -> Mapping[str, list[str]]:
-    """Reads MiniGrid's encodings, as rows of drawings."""
-    if path.suffix == ".npy":
-        array: NDArray[Any] = np.load(io.BytesIO(content), allow_pickle=False)
-    else:
-        array = np.array(json.loads(content))
-    if array.ndim not in (3, 4) or array.shape[-1] != 3 or array.dtype.kind not in "iu":
-        raise ValueError(
-            "must be MiniGrid's encoding of grids, whole numbers [W, H, 3] or [n, W, H, 3], got "
-            f"{array.dtype} {list(array.shape)}"
-        )
-    if array.ndim == 3:
-        return {path.stem: list(_drawn(array, path.stem))}
-    names = [f"{path.stem}_{number}" for number in range(len(array))]
-    return {name: list(_drawn(grid, name)) for name, grid in zip(names, array, strict=True)}
-
-
-def _drawn(grid: NDArray[Any], name: str) -> Iterator[str]:
-    """Yields the rows of a drawing of one grid [W, H, 3] of objects, colours and states."""
-    objects, states = grid[..., 0].T, grid[..., 2].T  # [H, W]
-    border = [objects[0], objects[-1], objects[:, 0], objects[:, -1]]
-    if min(objects.shape) > 2 and all((side == WALL_OBJECT).all() for side in border):
-        objects, states = objects[1:-1, 1:-1], states[1:-1, 1:-1]
-    if (objects == AGENT_OBJECT).sum() != 1:
-        raise ValueError(
-            f"level {name!r}: must have one agent (object {AGENT_OBJECT}), as "
-            "FullyObsWrapper shows it"
-        )
-    for row, state in zip(objects.tolist(), states.tolist(), strict=True):
-        marks = []
-        for number, direction in zip(row, state, strict=True):
-            if number == AGENT_OBJECT and 0 <= direction < len(AGENTS):
-                marks.append(AGENTS[direction])
-            elif number in OBJECT_MARKS:
-                marks.append(OBJECT_MARKS[number])
-            else:
-                raise ValueError(
-                    f"level {name!r}: object {number} with state {direction} is none of this maze's"
-                )
-        yield "".join(marks)

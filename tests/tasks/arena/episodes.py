@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
-from proposer_rl.tasks.batched_envs.env import BatchedEnv
+from proposer_rl.tasks.batched_envs import BatchedEnv
 
 
 def levels(seeds: int | None = None, **parameters: Any) -> TensorDict:

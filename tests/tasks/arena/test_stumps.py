@@ -7,8 +7,8 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from proposer_rl.tasks.arena.stumps import StumpsEnv
-from proposer_rl.tasks.batched_envs.env import uniform
+from proposer_rl.tasks.arena.planes import StumpsEnv
+from proposer_rl.tasks.batched_envs import uniform
 from tests.tasks.arena.episodes import levels, played
 
 STEPS = 80

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import check_env_specs
 
 from proposer_rl.tasks.arena.ways import CrowdEnv, FerryEnv, ForkEnv, IceEnv, RecallEnv
-from proposer_rl.tasks.batched_envs.env import uniform
+from proposer_rl.tasks.batched_envs import uniform
 from tests.tasks.arena.episodes import levels, play, played
 
 BOTH = levels(depth=[0.1, 0.96, 0.98, 1.0], length=[6, 2, 6, 2])

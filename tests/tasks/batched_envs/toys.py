@@ -9,8 +9,7 @@ from torch import Tensor
 
 from proposer_rl.learning import PPOSettings, SolverSettings
 from proposer_rl.task import ComputeContext
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
-from proposer_rl.tasks.batched_envs.task import BatchedTask
+from proposer_rl.tasks.batched_envs import BatchedEnv, BatchedTask, Step, Values
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings
 from proposer_rl.tasks.ranges import RangeSettings
 

@@ -24,6 +24,8 @@ def test_distribution_gives_its_specification(shape: tuple[int, ...] | int, mech
 def test_impossible_distribution_is_refused_at_once() -> None:
     with pytest.raises(ValueError, match=r"0\.95.*path_length=12"):
         LevelDistribution([(0.1, 3), (0.95, 12)])
+    with pytest.raises(ValueError, match=r"0\.9.*path_length=30"):
+        SpecificationSpace([0.1, 0.9], [2, 30])
 
 
 def test_numbers_run_through_lengths_first() -> None:
@@ -52,16 +54,3 @@ def test_coordinates_run_from_minus_one_to_one_along_each_axis() -> None:
     single = SpecificationSpace([0.0, 0.25], [2], height=6, width=6)
     assert single.coordinates.tolist() == [[-1, 0], [1, 0]]
     assert single.nearest(single.specifications).tolist() == [0, 1]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (([0.1, 0.9], [2, 30]), r"0\.9.*path_length=30"),
-        (([0.1, 0.1], [2]), "obstacle_fractions must be distinct"),
-        (([0.1], [2, 2]), "path_lengths must be distinct"),
-    ],
-)
-def test_impossible_spaces_are_refused(arguments: tuple[object, ...], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        SpecificationSpace(*arguments)

@@ -152,8 +152,8 @@ def test_impossible_specifications_are_named(
         ({"obstacle_fraction": 1.0}, "obstacle_fraction=1 must be"),
         ({"obstacle_fraction": -0.1}, "obstacle_fraction=-0.1 must be"),
         ({"obstacle_fraction": math.nan}, "obstacle_fraction=nan must be"),
-        ({"path_length": 0}, "path_length=0 at least 1"),
-        ({"path_length": 2.0}, "path_length must hold whole numbers"),
+        ({"path_length": 0}, "path_length=0 a whole number of at least 1"),
+        ({"path_length": 2.5}, "path_length=2.5 a whole number"),
         ({"height": 0}, "0x10"),
     ],
 )

@@ -11,13 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from proposer_rl.tasks.mazes import Level
-from proposer_rl.tasks.mazes import level_files as format_
-from proposer_rl.tasks.mazes.level_files import (
+from proposer_rl.tasks.mazes.drawings import (
+    SETS,
+    level_records,
     levels_from_text,
     levels_to_text,
     read_levels,
-    shipped_levels,
 )
+from proposer_rl.tasks.view_mazes.view_levels import ViewLevel
 from tests.tasks.mazes.oracles import path_length, random_levels
 
 HALLS = """\
@@ -47,13 +48,9 @@ def test_reads_the_documented_text() -> None:
     assert all(level.batch_size == torch.Size([]) for level in levels.values())
 
 
-def test_a_mark_of_the_encoding_is_no_part_of_a_level(tmp_path: Path) -> None:
-    (tmp_path / "bom.txt").write_text("S.G\n", encoding="utf-8-sig")
-    assert list(read_levels(tmp_path / "bom.txt")) == ["bom"]
-
-
-def test_a_drawing_alone_has_the_name_of_its_file(tmp_path: Path) -> None:
-    (tmp_path / "hall.txt").write_text("S.G\n")
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_a_drawing_alone_has_the_name_of_its_file(tmp_path: Path, encoding: str) -> None:
+    (tmp_path / "hall.txt").write_text("S.G\n", encoding)
     assert list(read_levels(tmp_path / "hall.txt")) == ["hall"]
 
 
@@ -69,72 +66,31 @@ def level_sets(draw: st.DrawFn) -> dict[str, Level]:
     for name in names:
         size = draw(st.tuples(st.integers(1, 7), st.integers(2, 9)))
         levels = random_levels(1, *size, 0.2, draw(st.integers(0, 1000)))
-        if path_length(levels[0]) > 0:
-            found[name] = levels[0]
+        found[name] = levels[0]
     return found
 
 
 @settings(max_examples=30)
 @given(level_sets())
 def test_round_trips(levels: dict[str, Level]) -> None:
-    if levels:
-        assert same(levels_from_text(levels_to_text(levels)), levels)
-
-
-def test_what_is_written_has_the_path_lengths() -> None:
-    levels = levels_from_text(HALLS)
-    assert levels_to_text(levels).count("path_length: ") == 2
-    for name, level in (("a]", "S.G"), (" a", "S.G"), ("a", "S#G")):  # could not be read again
-        with pytest.raises(ValueError, match=r"a name has|cannot be reached"):
-            levels_to_text({name: Level.from_text(level)})
-
-
-OF_TEXT = [
-    ("", "holds no levels"),
-    ("; nothing", "holds no levels"),
-    ("[a]\nS.G\n[a]\nS.G", "level 'a': the name occurs twice"),
-    ("[a]\nS.G\n..", "level 'a': a level is a rectangle"),
-    ("[a]\nS#G", "level 'a': the goal cannot be reached"),
-    ("[a]\npath_length: 3\nS.G", "path_length is 3, but the shortest path has 2 moves"),
-    ("[]\nS.G", "level '': a name has 1 to 80"),
-    ("[a[b]\nS.G", "level 'a[b': a name has 1 to 80 printable characters, no brackets"),
-    (f"[{'a' * 81}]\nS.G", "a name has 1 to 80 printable"),
-    ("[a\x1bb]\nS.G", "a name has 1 to 80 printable"),
-]
-OF_JSON = [
-    ("{", "Expecting property name"),
-    ("[]", 'an object with a list "levels"'),
-    ('{"levels": []}', "holds no levels"),
-    ('{"levels": [{"name": "a"}]}', "levels.0.level: missing"),
-    (
-        '{"levels": [{"name": "a", "level": ["S.G"], "path_length": 1}]}',
-        "path_length is 1, but the shortest path has 2 moves",
-    ),
-    ('{"levels": [{"name": "a", "level": ["S.G"], "size": 3}]}', "levels.0.size: unknown"),
-]
-NO_RECORDS = [
-    "{",
-    '{"seed": 0, "levels": []}',
-    '{"seed": 0, "updates": 1, "levels": [{}]}',
-    '{"seed": 0, "updates": 1, "levels": [{"text": ["S x"]}]}',
-]
-REFUSED = [
-    *(("bad.txt", text, message) for text, message in OF_TEXT),
-    *(("bad.json", text, message) for text, message in OF_JSON),
-    *(
-        ("bad.jsonl", f'{{"seed": 0, "updates": 1, "levels": []}}\n{line}\n', "line 2 is no record")
-        for line in NO_RECORDS
-    ),
-    ("bad.jsonl", "", "holds no levels"),
-    ("bad.csv", "", "must end in one of .txt, .json, .jsonl"),
-    ("bad.txt", b"\xff\xfe", "'utf-8' codec"),
-]
+    assert same(levels_from_text(levels_to_text(levels)), levels)
 
 
 @pytest.mark.parametrize(
     ("name", "content", "message"),
-    REFUSED,
-    ids=[f"{number}-{message}" for number, (*_, message) in enumerate(REFUSED)],
+    [
+        ("bad.txt", "; nothing", "holds no levels"),
+        ("bad.txt", "[a]\nS.G\n[a]\nS.G", "level 'a': the name occurs twice"),
+        ("bad.txt", "[a]\nS.G\n..", "level 'a': a level is a rectangle"),
+        ("bad.txt", "[a]\npath_length: 3\nS.G", "is 3, but the shortest path has 2 moves"),
+        ("bad.txt", b"\xff\xfe", "'utf-8' codec"),
+        ("bad.json", "{", "Invalid JSON"),
+        ("bad.json", '{"levels": []}', "holds no levels"),
+        ("bad.json", '{"levels": [{"name": "a"}]}', "levels.0.level: Field required"),
+        ("bad.jsonl", "", "holds no levels"),
+        ("bad.jsonl", '{"seed": 0, "levels": []}\n', "0.updates: Field required"),
+        ("bad.jsonl", '{"seed": 0, "updates": 1, "levels": [{"text": ["S x"]}]}\n', "rectangle"),
+    ],
 )
 def test_what_holds_no_levels_is_refused(
     name: str, content: str | bytes, message: str, tmp_path: Path
@@ -146,17 +102,8 @@ def test_what_holds_no_levels_is_refused(
     assert str(caught.value).startswith(f"{file}: ") and message in str(caught.value)
 
 
-def test_other_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(OSError, match=r"cannot read .*nothing.txt: No such file"):
-        read_levels(tmp_path / "nothing.txt")
-    monkeypatch.setattr(format_, "LARGEST_FILE_BYTES", 10)
-    (tmp_path / "large.txt").write_text(HALLS)
-    with pytest.raises(ValueError, match=r"large.txt: is larger than 10 bytes"):
-        read_levels(tmp_path / "large.txt")
-
-
 def test_shapes_are_what_they_are_called() -> None:
-    levels = shipped_levels("shapes")
+    levels = read_levels(SETS["shapes"])
     assert len(levels) >= 15
     for family in ("corridor", "rooms", "spiral", "labyrinth", "comb"):
         assert sum(family in name for name in levels) >= 3, family
@@ -171,9 +118,9 @@ def test_shapes_are_what_they_are_called() -> None:
 @pytest.mark.parametrize("name", ["shapes", "small"])
 def test_the_recorded_path_lengths_are_right(name: str) -> None:
     """By networkx; reading them has compared them with our own routine."""
-    text = (Path(format_.__file__).parent / f"{name}.txt").read_text()
+    text = SETS[name].read_text()
     recorded = [int(line.split(":")[1]) for line in text.splitlines() if "path_length" in line]
-    assert recorded == [path_length(level) for level in shipped_levels(name).values()]
+    assert recorded == [path_length(level) for level in read_levels(SETS[name]).values()]
 
 
 LINES = ["S • #", "# • G"]
@@ -199,3 +146,24 @@ def test_the_levels_of_a_run_are_read_from_its_record(tmp_path: Path) -> None:
         "seed_3_update_00010_2",
         "seed_4_update_00020_1",
     ]
+
+
+def test_levels_with_directions(tmp_path: Path) -> None:
+    """Drawn, in JSON, in a run's record; where there is none, an agent looks to the right."""
+    file, drawings = tmp_path / "mine.txt", ["v.#\n#.G", "..^\nG.#"]
+    file.write_text("[one]\n>..\n..G\n\n[two]\npath_length: 1\n^G\n\n[three]\nSG\n")
+    levels = read_levels(file, ViewLevel)
+    assert [int(level.direction) for level in levels.values()] == [0, 3, 0]
+    assert levels["one"].to_text() == ">..\n..G"
+    table = tmp_path / "mine.json"
+    table.write_text(json.dumps({"levels": [{"name": "a", "level": ["v.", ".G"]}]}))
+    assert read_levels(table, ViewLevel)["a"].to_text() == "v.\n.G"
+    records = [{"text": r["text"]} for r in level_records(ViewLevel.from_text(drawings), None)]
+    (tmp_path / "own.jsonl").write_text(
+        json.dumps({"updates": 5, "seed": 0, "levels": records}) + "\n"
+    )
+    again = read_levels(tmp_path / "own.jsonl", ViewLevel)
+    assert [level.to_text() for level in again.values()] == drawings
+    found, plain = read_levels(SETS["shapes"], ViewLevel), read_levels(SETS["shapes"])
+    assert all(int(found[name].direction) == 0 for name in plain)
+    assert all(found[name].walls.equal(plain[name].walls) for name in plain)

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from proposer_rl.models import ActorCritic, Population, UNet, cell_logits, map_actor_critic
 from proposer_rl.task import LevelResult
 from proposer_rl.tasks.mazes import Level, planes
+from proposer_rl.tasks.mazes.drawings import levels_from_text
 from proposer_rl.tasks.mazes.evaluation import RolloutEvaluator
-from proposer_rl.tasks.mazes.level_files import levels_from_text
-from proposer_rl.tasks.mazes.maze_settings import MazeSettings
+from proposer_rl.tasks.mazes.task import MazeSettings
 from tests.tasks.mazes.oracles import random_levels
 from tests.tiny import tiny_task
 

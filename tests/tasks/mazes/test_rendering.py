@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from proposer_rl.tasks.mazes import Level, draw_level
-from proposer_rl.tasks.mazes.rendering import (
+from proposer_rl.tasks.mazes.drawings import (
     AGENT_COLOUR,
     DIRECTION_COLOUR,
     FREE_COLOUR,

@@ -16,14 +16,15 @@ from proposer_rl.models import Population
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, EditableTask, OptimalTask
 from proposer_rl.tasks.mazes import Level
-from proposer_rl.tasks.mazes.maze_settings import (
+from proposer_rl.tasks.mazes.task import (
     DistributionSettings,
     MazeEvaluationSettings,
     MazeSettings,
+    MazeTask,
     SpaceSettings,
     UNetSettings,
+    faster_precision,
 )
-from proposer_rl.tasks.mazes.task import MazeTask, faster_precision
 from tests.host_reads import NoHostReads
 from tests.tiny import TASK, evaluate, learners, tiny_task
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from proposer_rl.tasks.point_masses.task import PointMassEnv
+from proposer_rl.tasks.point_masses import PointMassEnv
 
 DOWN, UP, RIGHT = (0.0, -1.0), (0.0, 1.0), (1.0, 0.0)
 

@@ -16,8 +16,7 @@ from torch import Tensor
 from proposer_rl.learning import SolverSettings, in_first_episode
 from proposer_rl.settings import settings
 from proposer_rl.task import ComputeContext
-from proposer_rl.tasks.batched_envs.env import BatchedEnv, Step, Values
-from proposer_rl.tasks.batched_envs.task import BatchedTask
+from proposer_rl.tasks.batched_envs import BatchedEnv, BatchedTask, Step, Values
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings
 from proposer_rl.tasks.ranges import RangeSettings
 
@@ -131,12 +130,11 @@ class PointMassTask(BatchedTask):
 
     Args:
         max_steps, network, levels, solver, context: as of
-            :class:`~proposer_rl.tasks.batched_envs.task.BatchedTask`.
+            :class:`~proposer_rl.tasks.batched_envs.BatchedTask`.
         parameters: what differs between levels.
 
     Raises:
-        ValueError: naming the key, for a parameter that is no range, or below zero where it cannot
-            be.
+        ValueError: naming the key, for a parameter that is no range.
     """
 
     title, noun, seeded = "point mass", "gates", False
@@ -161,10 +159,6 @@ class PointMassTask(BatchedTask):
             solver=solver,
             context=context,
         )
-        for name in ("width", "friction"):
-            for bins in (self.space.bins[name], self.target.bins[name]):
-                if bins.low[0] < 0:
-                    raise ValueError(f"parameters.{name}: {bins:} goes below zero")
 
     def pictures(
         self, levels: TensorDictBase, rollout: TensorDictBase | None

@@ -1,1 +1,0 @@
-"""Environments of one's own that step all levels of a batch at once, as tasks."""

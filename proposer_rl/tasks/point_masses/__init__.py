@@ -1,1 +1,0 @@
-"""The point mass before a gate of SPDL and CurrOT."""
