@@ -8,6 +8,7 @@ commands in forks of itself: each of its lines names an extra, the extra's folde
 
 from __future__ import annotations
 
+import faulthandler
 import gc
 import json
 import os
@@ -120,6 +121,7 @@ def _link(required: dict[str, metadata.Distribution], site: Path) -> None:
 
 
 RUN = "runs"
+LONGEST = 250  # seconds; a child that takes longer hangs: it shows where, and ends
 SMALL = ["compute.progress=false", "schedule.updates=1", "schedule.evaluate_every=1"]
 GYMNASIUM = [
     *SMALL, "task.max_steps=16", "task.evaluation.levels=2", "solver.batch_size=2",
@@ -195,11 +197,15 @@ def _play(command: Callable[..., Any], arguments: list[str]) -> None:
     if server == 0:
         os.dup2(says, 1)
         _end_with(_call, command, "play", arguments)
-    address = os.fdopen(said).readline().split()[1]
-    with urllib.request.urlopen(address) as page:
-        assert b"<html" in page.read()
-    os.kill(server, signal.SIGINT)
-    assert os.waitpid(server, 0)[1] == 0
+    os.close(says)
+    try:
+        address = os.fdopen(said).readline().split()[1]
+        with urllib.request.urlopen(address, timeout=LONGEST) as page:
+            assert b"<html" in page.read()
+    finally:
+        os.kill(server, signal.SIGINT)
+        _, status = os.waitpid(server, 0)
+    assert status == 0
 
 
 def _undrawn(folder: Path, title: str) -> Path:
@@ -233,6 +239,7 @@ def _run(extra: str) -> None:
 
 def _end_with(function: Callable[..., None], *given: Any) -> None:
     """End this process with whether that has gone well."""
+    faulthandler.dump_traceback_later(LONGEST, exit=True, file=2)
     code = 1
     try:
         function(*given)
