@@ -5,9 +5,12 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
+import pytest
+
 from proposer_rl.report import studies
 
 RESULTS = Path(__file__).parents[1] / "results"
+needs_results = pytest.mark.skipif(not RESULTS.is_dir(), reason="source archives have no results/")
 
 
 def remember() -> None:

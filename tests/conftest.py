@@ -50,6 +50,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.parent == Path(__file__).parent / "research":
             item.add_marker("research")
+        if item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.timeout(3600))
     # First what lasts longest, so that no process waits at the end for another's; they share one
     # process that forks.
     long = {"processes", "call_there"}

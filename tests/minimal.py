@@ -8,9 +8,12 @@ commands in forks of itself: each of its lines names an extra, the extra's folde
 
 from __future__ import annotations
 
+import faulthandler
 import gc
 import json
 import os
+import shutil
+import subprocess
 import sys
 import sysconfig
 import traceback
@@ -18,10 +21,12 @@ import venv
 import zipfile
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import redirect_stdout
 from functools import cache
 from importlib import metadata
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 
@@ -49,6 +54,25 @@ def make_environment(folder: Path, wheel: Path, extras: list[str]) -> dict[str, 
         names = closure(project, extra) - always if extra else always
         _link({name: metadata.distribution(name) for name in names}, sites[extra])
     return sites
+
+
+def interpreter(version: str) -> str | None:
+    """The path of an interpreter of a version, such as "3.12", that can make environments."""
+    installed = sorted(Path.home().glob(f".pyenv/versions/{version}.*/bin/python"))
+    ours = sys.executable if sys.version.startswith(f"{version}.") else None
+    for python in filter(None, [ours, shutil.which(f"python{version}"), *map(str, installed)]):
+        tried = [python, "-c", "import ensurepip, venv"]
+        if subprocess.run(tried, check=False, capture_output=True).returncode == 0:
+            return python
+    return None
+
+
+def pip(folder: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Calls the pip of an environment."""
+    return subprocess.run(
+        [folder / "bin" / "python", "-m", "pip", "--disable-pip-version-check", *arguments],
+        cwd=folder, capture_output=True, text=True, check=False,
+    )  # fmt: skip
 
 
 def share_bytecode(prefix: str, sites: Iterable[Path]) -> None:
@@ -120,6 +144,7 @@ def _link(required: dict[str, metadata.Distribution], site: Path) -> None:
 
 
 RUN = "runs"
+LONGEST = 250  # seconds; a child that takes longer hangs: it shows where, and ends
 SMALL = ["compute.progress=false", "schedule.updates=1", "schedule.evaluate_every=1"]
 GYMNASIUM = [
     *SMALL, "task.max_steps=16", "task.evaluation.levels=2", "solver.batch_size=2",
@@ -191,15 +216,24 @@ def _play(command: Callable[..., Any], arguments: list[str]) -> None:
     import urllib.request
 
     said, says = os.pipe()
-    server = os.fork()
-    if server == 0:
-        os.dup2(says, 1)
-        _end_with(_call, command, "play", arguments)
-    address = os.fdopen(said).readline().split()[1]
-    with urllib.request.urlopen(address) as page:
-        assert b"<html" in page.read()
-    os.kill(server, signal.SIGINT)
-    assert os.waitpid(server, 0)[1] == 0
+    lines = open(said)  # noqa: SIM115  until nothing more is written
+    pages = []
+
+    def visit() -> None:
+        try:
+            address = lines.readline().split()[1]
+            with urllib.request.urlopen(address, timeout=LONGEST) as page:
+                pages.append(page.read())
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    # No fork, which could wait for ever for what threads of the training hold.
+    visitor = Thread(target=visit, daemon=True)
+    visitor.start()
+    with open(says, "w", buffering=1) as output, redirect_stdout(output):
+        _call(command, "play", arguments)
+    visitor.join()
+    assert b"<html" in pages[0]
 
 
 def _undrawn(folder: Path, title: str) -> Path:
@@ -264,6 +298,7 @@ def _main() -> None:
             output = os.open("output", os.O_CREAT | os.O_WRONLY)
             os.dup2(output, 1)
             os.dup2(output, 2)
+            faulthandler.dump_traceback_later(LONGEST, exit=True, file=2)
             if extra:
                 sys.path.append(site)
             _end_with(_run, extra)

@@ -8,6 +8,7 @@ since threads do not survive a fork.
 from __future__ import annotations
 
 import ctypes
+import faulthandler
 import fcntl
 import gc
 import json
@@ -33,6 +34,7 @@ from proposer_rl.runs.process import PROGRESS
 ROOT = Path(__file__).resolve().parents[1]
 CAPABILITIES_VERSION = 0x20080522  # capget(2)
 CAP_DAC_OVERRIDE = 1
+LONGEST = 200  # seconds; a child that takes longer hangs: it shows where, and ends
 
 
 @dataclass
@@ -114,7 +116,10 @@ class Processes:
         """End the process that forks."""
         assert self._server.stdin is not None
         self._server.stdin.close()
-        self._server.wait()
+        try:
+            self._server.wait(LONGEST)
+        finally:
+            self._server.kill()
 
 
 def python(
@@ -201,6 +206,7 @@ def _become_child(request: Request, said: int, counted: int) -> None:
         os.dup2(said, 1)
         os.dup2(said, 2)
         os.close(said)
+        faulthandler.dump_traceback_later(LONGEST, exit=True, file=2)
         os.chdir(request.folder)
         _note_writes(request.signal_at, request.lost_at, counted)
         if request.largest_file is not None:

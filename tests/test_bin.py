@@ -179,3 +179,26 @@ def test_a_stage_that_fails_gives_its_status(failing: str, tmp_path: Path) -> No
         expected += [f"== {stage}", f"{'bad' if module == failing else 'ran'} {module}"]
     assert ended.stdout.splitlines() == (expected[:2] if failing == "ruff" else expected)
     assert ended.returncode == (0 if failing == "nothing" else 3)
+
+
+def test_ci_ends_with_the_tests_whatever_they_leave_behind(tmp_path: Path) -> None:
+    (tmp_path / ".ci").mkdir()
+    (tmp_path / "bin").mkdir()
+    shutil.copy(BIN.parent / ".ci" / "run", tmp_path / ".ci")
+    script = (
+        '#!/bin/sh\n[ "$1" = --version ] && exit\nsleep 20 &\necho "1 failed in 2.00s"\nexit 3\n'
+    )
+    for name in ("test", "chromium"):
+        (tmp_path / "bin" / name).write_text(script)
+        (tmp_path / "bin" / name).chmod(0o755)
+    path = {"PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}"}
+    ended = subprocess.run(
+        [tmp_path / ".ci" / "run"],
+        env=os.environ | path,
+        capture_output=True,
+        text=True,
+        timeout=15,
+        check=False,
+    )
+    assert ended.returncode == 3
+    assert ended.stdout.splitlines() == ["1 failed in 2.00s"] * 2

@@ -22,6 +22,7 @@ from proposer_rl.cli.groups import arranged
 from proposer_rl.recipes import CONFIG_FOLDER, maker
 from proposer_rl.settings import check_names, schema
 from tests.commands import SMOKE, call, trained_run
+from tests.committed import needs_results
 from tests.test_bin import MODULES
 from tests.test_readme import DOCS, README, ROOT, blocks, commands, run, smallest, write_files
 
@@ -169,6 +170,7 @@ def test_the_commands_about_levels_run() -> None:
     assert Path("scores.csv").is_file()
 
 
+@needs_results
 def test_pages_link_to_what_is_there() -> None:
     """Sphinx checks links within the site; this, those to files outside of it."""
     for page, text in PAGES.items():

@@ -8,7 +8,7 @@ from signal import SIGKILL
 from typing import Any
 
 from tests.commands import SMOKE
-from tests.processes import Ended, Processes
+from tests.processes import Processes
 from tests.same_run import assert_same_run
 
 # A checkpoint at every safe point. Episodes of a Proposer's copies are none: they are played again.
@@ -20,11 +20,11 @@ FEW += ["proposer.ppo.epochs=1", "task.evaluation.distributions=[id]", "task.eva
 MOMENTS = ["", "", "fsync .step_", "replace .step_"]
 
 
-def moment(draw: random.Random, kind: int, whole: Ended) -> dict[str, Any]:
+def moment(draw: random.Random, kind: int, seconds: float, writes: list[str]) -> dict[str, Any]:
     """A seeded moment not too late in a run, which has further ones before it, as an option."""
     if kind == 0:
-        return {"signals": [(draw.uniform(0.3, 0.6) * whole.seconds, SIGKILL)]}
-    early = whole.writes[: len(whole.writes) * 2 // 5]
+        return {"signals": [(draw.uniform(0.3, 0.6) * seconds, SIGKILL)]}
+    early = writes[: len(writes) * 2 // 5]
     candidates = [i for i, name in enumerate(early) if name.startswith(MOMENTS[kind])]
     return {"signal_at": {draw.choice(candidates): SIGKILL}}
 
@@ -36,10 +36,10 @@ def test_killed_at_random_moments_a_run_is_that_which_was_never_stopped(
     command = ["+method=perf_gain", *FEW]
     whole = processes(*command, f"hydra.run.dir={tmp_path / 'whole'}")
     assert whole.code == 0, whole.output
-    kinds, attempt = [*range(len(MOMENTS))], 0
+    kinds, attempt, seconds = [*range(len(MOMENTS))], 0, whole.seconds
     while kinds:
         folder = tmp_path / str(attempt)
-        options = moment(draw, kinds[-1], whole)
+        options = moment(draw, kinds[-1], seconds, whole.writes)
         ended = processes(*command, f"hydra.run.dir={folder}", **options)
         if ended.code == -SIGKILL:
             kinds.pop()
@@ -47,6 +47,8 @@ def test_killed_at_random_moments_a_run_is_that_which_was_never_stopped(
             assert ended.code == 0, ended.output
             assert_same_run(tmp_path / "whole", folder)
             attempt += 1
+            seconds /= 2  # the machine may have been busy when it was measured
+            assert attempt < 10
     ended = processes(*command, f"hydra.run.dir={folder}")
     assert ended.code == 0, ended.output
     assert_same_run(tmp_path / "whole", folder)

@@ -14,6 +14,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import pytest
@@ -22,16 +23,19 @@ import yaml
 from proposer_rl.recipes import available
 from tests import minimal
 from tests.test_bin import MODULES
+from tests.test_readme import README, blocks
 
 ROOT = Path(__file__).parents[1]
+CONSTRAINTS = ROOT / "constraints.txt"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
 class Built(NamedTuple):
-    """A source archive, the wheel made of it, and the folder that this is unpacked in."""
+    """A source archive, the wheel made of it, and the folders that they are unpacked in."""
 
     archive: Path
     wheel: Path
+    source: Path
     site: Path
 
 
@@ -57,7 +61,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
     (wheel,) = folder.glob("*.whl")
     with zipfile.ZipFile(wheel) as unpacked:
         unpacked.extractall(folder / "site")
-    return Built(archive, wheel, folder / "site")
+    return Built(archive, wheel, source, folder / "site")
 
 
 # Each extra that a method, a task or a command names; the empty one is none.
@@ -156,12 +160,87 @@ def test_a_wheel_holds_the_package_and_its_configuration(built: Built) -> None:
     assert top - {".."} == {"proposer_rl", distribution._path.name}
 
 
-def test_a_source_archive_holds_no_results_and_no_tests(built: Built) -> None:
-    with tarfile.open(built.archive) as archive:
-        top = {name.split("/")[1] for name in archive.getnames()}
-    assert {"proposer_rl", "conf", "docs", "examples", "README.md", "CHANGELOG.md"} <= top
-    assert "LICENSE" in top
-    assert not {"results", "tests", ".ci", "site", "outputs"} & top
+def test_a_source_archive_holds_all_but_the_results(built: Built) -> None:
+    top = {path.name for path in built.source.iterdir()}
+    assert {"proposer_rl", "conf", "docs", "examples", "tests", "research", "bin", ".ci"} <= top
+    assert {"README.md", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "LICENSE"} <= top
+    assert not {"results", "site", "outputs", ".venv"} & top
+
+
+@pytest.mark.slow
+def test_a_source_archive_passes_its_own_tests(built: Built) -> None:
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "auto", "--dist", "worksteal"]
+    done = subprocess.run(
+        [*command, "-m", "not slow and not research"],
+        cwd=built.source,
+        env=os.environ | {"PYTHONPATH": str(built.source), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout[-5000:]
+
+
+PYTHONS = [
+    version
+    for line in PROJECT["classifiers"]
+    if re.fullmatch(r"3\.\d+", version := line.removeprefix("Programming Language :: Python :: "))
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["wheel", "archive"])
+@pytest.mark.parametrize("python", PYTHONS)
+def test_pip_installs_it_in_a_new_environment(
+    python: str, kind: str, built: Built, tmp_path: Path
+) -> None:
+    """Outside of the checkout, with the versions of constraints.txt."""
+    found = minimal.interpreter(python)
+    if found is None:
+        pytest.skip(f"there is no Python {python} that can make an environment")
+    with TemporaryDirectory() as name:  # a gigabyte and more, which pytest would keep
+        folder = Path(name)
+        subprocess.run([found, "-m", "venv", folder], check=True)
+        (torch,) = re.findall("^torch==.*$", CONSTRAINTS.read_text(), re.MULTILINE)
+        here = minimal.pip(folder, "install", "--dry-run", "--no-deps", "--no-index", torch)
+        if here.returncode:
+            pytest.skip(f"no {torch} for Python {python} lies where pip finds links")
+        (project,) = metadata.distributions(path=[str(built.site)])
+        required = [line for line in project.requires or [] if "extra ==" not in line]
+        done = minimal.pip(folder, "install", "-q", "-c", CONSTRAINTS, torch, *required)
+        if done.returncode:
+            pytest.skip(f"pip cannot install what it requires: {done.stderr.splitlines()[-1]}")
+        done = minimal.pip(folder, "install", "-q", "-c", CONSTRAINTS, getattr(built, kind))
+        assert done.returncode == 0, done.stderr
+        assert minimal.pip(folder, "check").returncode == 0
+        lines = "\n".join(block for block in blocks("python", README) if "prl.Teacher(" in block)
+        assert lines
+        (tmp_path / "loop.py").write_text(f"import proposer_rl as prl\n{lines}")
+        run = "outputs/run"
+        for command, *arguments in (
+            ["proposer-train", "+method=perf_gain", "+scale=smoke", f"hydra.run.dir={run}"],
+            ["proposer-report", run],
+            ["python", "-I", "loop.py"],
+        ):
+            ended = subprocess.run(
+                [folder / "bin" / command, *arguments],
+                cwd=tmp_path,
+                env={"PATH": os.environ["PATH"], "HOME": name},
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            assert ended.returncode == 0, ended.stderr[-5000:]
+        assert list(tmp_path.rglob("report.html"))
+
+
+def test_the_same_versions_are_checked_everywhere() -> None:
+    """Those of Python in the service's workflow, that of ruff before commits."""
+    workflow = yaml.safe_load((ROOT / ".github/workflows/tests.yml").read_text(encoding="utf-8"))
+    assert workflow["jobs"]["tests"]["strategy"]["matrix"]["python"] == PYTHONS
+    (ruff,) = re.findall("^ruff==.*$", CONSTRAINTS.read_text(), re.MULTILINE)
+    (hooks,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    assert [hook["additional_dependencies"] for hook in hooks["hooks"]] == [[ruff]] * 2
 
 
 def test_every_command_of_the_checkout_is_installed() -> None:

@@ -6,11 +6,12 @@ import os
 import re
 import shutil
 import socket
+import subprocess
 import sys
 import webbrowser
 from pathlib import Path
 from signal import SIGINT
-from typing import NoReturn
+from subprocess import PIPE, STDOUT
 
 import httpx
 import pytest
@@ -19,9 +20,9 @@ import uvicorn
 from proposer_rl import extras
 from proposer_rl.cli import play
 from proposer_rl.extras import install_command
+from tests.processes import LONGEST, ROOT
 
-# It waits as long as it takes: a busy machine is slow.
-CLIENT = httpx.Client(timeout=None, trust_env=False)
+CLIENT = httpx.Client(timeout=LONGEST, trust_env=False)  # a busy machine is slow
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
@@ -33,37 +34,27 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return said.err.splitlines()[-1]
 
 
-def serve(run: Path, folder: Path, output: int) -> NoReturn:
-    """The command in a process of its own: one that was forked from this, which has imported it."""
-    code = 1
-    try:
-        os.dup2(output, 1)
-        os.chdir(folder)
-        with open(1, "w", buffering=1) as sys.stdout:
-            sys.stderr = sys.stdout
-            play.main([str(run)])
-            code = 0
-    finally:
-        os._exit(code)
-
-
 def test_it_tells_its_address_and_ends_on_ctrl_c(run: Path, tmp_path: Path) -> None:
-    said, output = os.pipe()
-    child = os.fork()
-    if child == 0:
-        serve(run, tmp_path, output)
-    os.close(output)
-    with open(said) as lines:
-        found = re.search(r"http://127\.0\.0\.1:(\d+)/([\w-]{40,})/", lines.readline())
-        assert found
-        assert CLIENT.get(f"{found[0]}api/run").json()["checkpoints"] == [1, 2, 3]
-        assert CLIENT.get(f"http://127.0.0.1:{found[1]}/").status_code == 403
-        for address in own_addresses():  # from outside of the machine there is nothing
-            with pytest.raises(OSError), socket.create_connection((address, int(found[1])), 5):
-                pass
-        os.kill(child, SIGINT)
-        assert lines.read() == "Ended.\n"
-    assert os.waitpid(child, 0)[1] == 0
+    command = [sys.executable, "-m", "proposer_rl.cli.play", run]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        command, cwd=tmp_path, env=environment, text=True, stdout=PIPE, stderr=STDOUT
+    ) as served:
+        try:
+            assert served.stdout is not None
+            line = served.stdout.readline()
+            found = re.search(r"http://127\.0\.0\.1:(\d+)/([\w-]{40,})/", line)
+            assert found
+            assert CLIENT.get(f"{found[0]}api/run").json()["checkpoints"] == [1, 2, 3]
+            assert CLIENT.get(f"http://127.0.0.1:{found[1]}/").status_code == 403
+            for address in own_addresses():  # from outside of the machine there is nothing
+                with pytest.raises(OSError), socket.create_connection((address, int(found[1])), 5):
+                    pass
+            served.send_signal(SIGINT)
+            assert served.communicate(timeout=LONGEST)[0] == "Ended.\n"
+        finally:
+            served.kill()
+    assert served.returncode == 0
     assert list(tmp_path.iterdir()) == []
 
 

@@ -12,6 +12,7 @@ from proposer_rl.cli.report import main as report
 from proposer_rl.cli.train import main as train
 from proposer_rl.cli.watch import main as watch
 from tests.commands import LITTLE, call
+from tests.committed import needs_results
 from tests.tasks.gymnasium.toys import TINY
 
 ROOT = Path(__file__).parents[1]
@@ -85,6 +86,7 @@ def test_the_code_runs() -> None:
         exec(block, names)
 
 
+@needs_results
 def test_what_it_links_to_is_there() -> None:
     for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", README):
         assert (ROOT / target).is_file(), target

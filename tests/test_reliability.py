@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from signal import SIGHUP, SIGINT, SIGKILL, SIGTERM, SIGUSR1
 from typing import Any
@@ -19,7 +20,7 @@ import pytest
 from proposer_rl.runs.checkpoint import load_latest, save_checkpoint
 from proposer_rl.runs.process import locked
 from tests.commands import SMOKE
-from tests.processes import ROOT, Ended, Processes
+from tests.processes import LONGEST, ROOT, Ended, Processes
 from tests.same_run import assert_same_run
 
 FEW = [*SMOKE, "schedule.updates=4"]
@@ -134,10 +135,14 @@ def test_ctrl_c_at_a_pipeline_with_tee_saves(tmp_path: Path) -> None:
     bash = ["bash", "-c", f"trap : INT; {line}"]
     pipeline = subprocess.Popen(bash, cwd=tmp_path, env=environment, start_new_session=True)
     metrics = tmp_path / "run" / "metrics.csv"
-    while pipeline.poll() is None and not (metrics.exists() and metrics.stat().st_size > 1000):
-        time.sleep(0.05)
-    os.killpg(pipeline.pid, SIGINT)
-    assert pipeline.wait() == 128 + SIGINT
+    try:
+        while pipeline.poll() is None and not (metrics.exists() and metrics.stat().st_size > 1000):
+            time.sleep(0.05)
+        os.killpg(pipeline.pid, SIGINT)
+        assert pipeline.wait(LONGEST) == 128 + SIGINT
+    finally:  # otherwise it would train on, and keep this process's output open
+        with suppress(ProcessLookupError):
+            os.killpg(pipeline.pid, SIGKILL)
     assert load_latest(tmp_path / "run" / "checkpoints") is not None
 
 

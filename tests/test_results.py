@@ -21,7 +21,9 @@ from proposer_rl.report.outcomes import comparison_table, group_table
 from proposer_rl.report.studies import read_studies
 from proposer_rl.report.tables import escape_markdown
 from research import pages
+from tests.committed import needs_results
 
+pytestmark = needs_results
 ROOT = Path(__file__).parents[1]
 FRAMES = "with the curriculum's (M)"
 # Pages with tables, updates of the runs in them, folder of their results, headline, least number of

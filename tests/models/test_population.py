@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import faulthandler
 import os
-import signal
 
 import pytest
 import torch
@@ -136,9 +136,12 @@ def test_a_forked_process_has_threads_of_its_own() -> None:
     population(torch.rand(2, 1, 3, 8, 8))
     child = os.fork()
     if child == 0:
-        signal.alarm(20)  # without threads the child would wait for ever
-        population(torch.rand(2, 1, 3, 8, 8))
-        os._exit(0)
+        faulthandler.dump_traceback_later(20, exit=True)  # without threads it would wait for ever
+        try:
+            population(torch.rand(2, 1, 3, 8, 8))
+            os._exit(0)
+        finally:
+            os._exit(1)
     _, status = os.waitpid(child, 0)
     assert status == 0
 

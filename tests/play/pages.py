@@ -46,7 +46,8 @@ def served(run: Path) -> Iterator[Page]:
     with listen(0) as listening:
         port = listening.getsockname()[1]
         running = server(application(open_session(run), TOKEN))
-        thread = Thread(target=running.run, kwargs={"sockets": [listening]})
+        # One that hangs must not keep the tests from their end.
+        thread = Thread(target=running.run, kwargs={"sockets": [listening]}, daemon=True)
         thread.start()
         while not running.started and thread.is_alive():
             sleep(0.01)
@@ -54,5 +55,6 @@ def served(run: Path) -> Iterator[Page]:
             yield Page(port, f"http://127.0.0.1:{port}/{TOKEN}/", run)
         finally:
             running.should_exit = True
-            thread.join()
+            thread.join(60)
+            assert not thread.is_alive()
     assert files(run) == before

@@ -28,7 +28,7 @@ from tests.play.pages import Page, served
 
 ROWS = ["S....", ".##..", "....G", ".....", "#...."]
 # One for all: each would read the certificates of the machine anew.
-CLIENT = httpx.Client(timeout=None, trust_env=False)
+CLIENT = httpx.Client(timeout=200, trust_env=False)
 JSON = {"Content-Type": "application/json"}
 EXAMINE = {"checkpoint": 3, "solver": 0, "rows": ROWS}
 

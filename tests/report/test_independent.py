@@ -16,11 +16,14 @@ from scipy import integrate, stats
 from proposer_rl.report.outcomes import comparison_table, group_table
 from proposer_rl.report.statistics import FEWEST, HELD
 from proposer_rl.report.studies import read_studies
+from tests.committed import RESULTS
 from tests.report.folders import write_run
 
-RESULTS = Path(__file__).parents[2] / "results"
-COMMITTED = [file.parent for file in sorted(RESULTS.glob("*/runs.csv.xz"))]
-COMMITTED.remove(RESULTS / "medium_lives")  # a single run of each
+COMMITTED = [
+    file.parent
+    for file in sorted(RESULTS.glob("*/runs.csv.xz"))
+    if file.parent.name != "medium_lives"  # a single run of each
+]
 
 
 def outcomes_of(metrics: pd.DataFrame, columns: pd.Index) -> pd.DataFrame:

@@ -28,8 +28,9 @@ from research.tiny_lm import (
     problem,
     to_end,
 )
+from tests.committed import RESULTS, needs_results
 
-RESULTS = Path(__file__).parents[2] / "results/prompts"
+PUBLISHED = RESULTS / "prompts"
 TINY = Setting(prompts=3, held_out=2, batch=4, group=3, rounds=4, every=2, warm=2, examples=4)
 SIZES = Sizes(2, 16, 2)
 
@@ -190,5 +191,6 @@ def test_a_study_goes_on_where_it_was_and_refuses_another_setting(
         assert end.value.code == 2 and said in capsys.readouterr().err
 
 
+@needs_results
 def test_the_page_follows_from_its_tables() -> None:
-    assert page(read(RESULTS), **prompts.NAMES) in (RESULTS / "README.md").read_text("utf-8")
+    assert page(read(PUBLISHED), **prompts.NAMES) in (PUBLISHED / "README.md").read_text("utf-8")

@@ -17,7 +17,7 @@ import pytest
 import proposer_rl
 from proposer_rl.experiment import Experiment
 from proposer_rl.runs.process import STOP_SIGNALS, Interrupted, StopSignals
-from tests.processes import ROOT, python
+from tests.processes import LONGEST, ROOT, python
 from tests.same_run import assert_same_run
 
 
@@ -180,7 +180,10 @@ def test_a_call_whose_output_nobody_reads_comes_to_its_end_and_draws_nothing(
     )
     os.close(reader)
     os.close(writer)
-    assert child.wait() == 0
+    try:
+        assert child.wait(LONGEST) == 0
+    finally:
+        child.kill()
 
 
 def test_other_threads_change_nothing() -> None:

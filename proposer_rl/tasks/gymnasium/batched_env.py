@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import multiprocessing
+import pickle
 import signal
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Connection
+from threading import Lock
+from types import ModuleType
 from typing import Any, Literal
 
+import cloudpickle
+import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.vector.utils import CloudpickleWrapper
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch.utils._pytree import tree_map
@@ -34,10 +39,12 @@ from proposer_rl.tasks.parameters import SEED
 
 Vectorization = Literal["sync", "async"]
 FLAGS = ("success", "is_init")  # entries that no Solver sees
-# A forked process need not import torch again, of which it has no use.
-CONTEXT: Any = multiprocessing.get_context(
-    "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-)
+# A fork of this process would inherit the locks that its other threads hold, torch's among them,
+# and wait for them forever. The fork server has no threads, and imports torch once for all.
+_FORKSERVER = "forkserver" in multiprocessing.get_all_start_methods()  # not on Windows
+CONTEXT: Any = multiprocessing.get_context("forkserver" if _FORKSERVER else "spawn")
+GRACE = 10.0  # seconds that a process has for its end
+_STARTING = Lock()
 
 
 class GymnasiumEnv(EnvBase):
@@ -74,8 +81,10 @@ class GymnasiumEnv(EnvBase):
         super().__init__(device=levels.device or "cpu", batch_size=levels.batch_size)
         self._reward_scale = reward_scale
         self._plays = plays(levels)
+        registered = gymnasium.registry.get(make.env_id)
         players = [
-            partial(LevelPlayer, make, parameters, play, success, once) for play in self._plays
+            partial(_player, registered, make, parameters, play, success, once)
+            for play in self._plays
         ]
         self._vector: SyncVectorEnv | ProcessVectorEnv
         if vectorization == "sync":
@@ -192,17 +201,22 @@ class ProcessVectorEnv:
         self._parts = np.array_split(np.arange(len(makes)), min(count, len(makes)))
         self._pipes: list[Connection] = []
         self.processes = []
-        for part in self._parts:
+        if _FORKSERVER:
+            CONTEXT.set_forkserver_preload([__name__])
+        for _ in self._parts:
             ours, theirs = CONTEXT.Pipe()
-            some = [makes[index] for index in part]
-            side_by_side = partial(SyncVectorEnv, some, autoreset_mode=AutoresetMode.DISABLED)
-            make: Any = CloudpickleWrapper(side_by_side)
-            process = CONTEXT.Process(target=_serve, args=(theirs, ours, make), daemon=True)
-            process.start()
+            process = CONTEXT.Process(target=_serve, args=(theirs,), daemon=True)
+            with _without_script():
+                process.start()
             theirs.close()
             self._pipes.append(ours)
             self.processes.append(process)
-        found = self._ask("spaces", [()] * len(self._pipes))
+        # Cloudpickle sends classes and functions of a script as they are.
+        vectors = [
+            partial(SyncVectorEnv, [makes[i] for i in part], autoreset_mode=AutoresetMode.DISABLED)
+            for part in self._parts
+        ]
+        found = self._ask("make", [(cloudpickle.dumps(vector),) for vector in vectors])
         self.single_observation_space: spaces.Space[Any] = found[0][0]
         self.single_action_space: spaces.Space[Any] = found[0][1]
 
@@ -234,12 +248,14 @@ class ProcessVectorEnv:
         self._ask("set_attr", [(name, [values[i] for i in part]) for part in self._parts])
 
     def close(self) -> None:
-        """Ends the processes."""
-        for pipe, process in zip(self._pipes, self.processes, strict=True):
-            # Processes that were forked later have the pipe, too: closing it would tell nothing.
-            with suppress(OSError):
-                pipe.send(None)
-            process.join()
+        """Ends the processes; one that still works after ten seconds is killed."""
+        for pipe in self._pipes:
+            pipe.close()
+        for process in self.processes:
+            process.join(GRACE)
+            if process.is_alive():
+                process.kill()
+                process.join(GRACE)
 
     def _ask(self, what: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Returns the answers of all processes, which work at the same time.
@@ -266,32 +282,50 @@ class ProcessVectorEnv:
         return [answer for _, answer in answers]
 
 
-def _serve(pipe: Connection, parents: Connection, make: Callable[[], Any]) -> None:
+def _player(registered: gymnasium.envs.registration.EnvSpec | None, *given: Any) -> LevelPlayer:
+    """Returns a player, also in a process that does not know the environment's name yet."""
+    if registered is not None:
+        gymnasium.registry.setdefault(registered.id, registered)
+    return LevelPlayer(*given)
+
+
+@contextmanager
+def _without_script() -> Iterator[None]:
+    """Starts processes that do not run the script again, which may have no ``__main__`` guard."""
+    with _STARTING:
+        script = sys.modules["__main__"]
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = script
+
+
+def _serve(pipe: Connection) -> None:
     """Steps environments until the pipe is closed, or the parent is gone."""
-    parents.close()
-    # As its parent, which saves its work first, a forked process would otherwise answer signals.
+    # The parent is asked to stop by these, and saves its work first; this process ends with it.
+    for name in ("SIGINT", "SIGHUP", "SIGUSR1", "SIGUSR2"):
+        if hasattr(signal, name):  # Windows has the first alone
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    env, seen = None, None
-    while True:
-        try:
-            asked = pipe.recv()
-        except EOFError:
-            return
-        if asked is None:
-            return
-        what, given = asked
-        try:
-            env = env or make()
-            if what == "spaces":
-                answer: Any = env.single_observation_space, env.single_action_space
-            elif what == "reset":
-                # A vector environment takes no mask in which nothing is true.
-                if given[0] is None or given[0]["reset_mask"].any():
-                    seen = env.reset(options=given[0])[0]
-                answer = seen
-            else:
-                answer = getattr(env, what)(*given)
-            pipe.send((False, answer))
-        except Exception as error:
-            pipe.send((True, error))
+    torch.set_num_threads(1)  # there are as many processes as cores
+    env: Any = None
+    seen = None
+    with suppress(EOFError, OSError):  # the pipe's; the environments' are answers
+        while True:
+            what, given = pipe.recv()
+            try:
+                if what == "make":
+                    env = pickle.loads(given[0])()
+                    answer: Any = env.single_observation_space, env.single_action_space
+                elif what == "reset":
+                    # A vector environment takes no mask in which nothing is true.
+                    if given[0] is None or given[0]["reset_mask"].any():
+                        seen = env.reset(options=given[0])[0]
+                    answer = seen
+                else:
+                    answer = getattr(env, what)(*given)
+                failed = False
+            except Exception as error:
+                failed, answer = True, error
+            pipe.send((failed, answer))

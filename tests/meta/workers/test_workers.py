@@ -74,7 +74,7 @@ def test_workers_give_the_numbers_of_one_process_also_where_they_die(
         if engine == "multiprocess" and next(losses):
             process = replicas._collector.procs[1]
             os.kill(process.pid, SIGKILL)
-            process.join()
+            process.join(60)
 
     handler = signal(SIGTERM, lambda *_: None)
     try:

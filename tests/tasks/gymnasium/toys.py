@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from importlib.util import find_spec
+from threading import Lock
 from typing import Any
 
 import gymnasium
@@ -45,6 +46,9 @@ NO_BOX2D = pytest.mark.skipif(
     sys.version_info >= (3, 14) and find_spec("Box2D") is None,
     reason="Box2D would have to be compiled for this Python",
 )
+
+
+LOCK = Lock()
 
 
 class Engine:
