@@ -19,6 +19,7 @@ from proposer_rl.learning import SolverSettings
 from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import CANNOT_BE_CALLED, completed
 from proposer_rl.recipes import maker
+from proposer_rl.runs.folder import storage
 from proposer_rl.settings import arguments, settings, within
 
 # What a task's maker is given beside the task's own settings.
