@@ -191,7 +191,7 @@ def test_tasks_and_curricula_of_ones_own(tmp_path: Path, monkeypatch: pytest.Mon
     run = prl.train(task, "plr", updates=2, folder=tmp_path / "1", settings=sledges, progress=False)
     assert "target_success" in run.metrics
     assert type(run.task()).__name__ == "SledgeTask"
-    curriculum = prl.curricula.own(Again, probability=np.float32(0.5))
+    curriculum = prl.curricula.own(Again)
     run = prl.train("maze", curriculum, updates=2, folder=tmp_path / "2", **SMOKE)
     assert run.summary["method"] == "Again"
 
@@ -217,7 +217,7 @@ def test_a_score_of_ones_own_in_a_run_and_in_a_teacher(tmp_path: Path) -> None:
     teacher.tell(ids, levels["gravity"])
     teacher.ask(8)  # by which the outcomes have been taken
     mean = float(1 - levels["gravity"].mean())
-    assert teacher.log()["mean_score"] == pytest.approx([mean])
+    assert teacher.log()["mean_score"] == pytest.approx(mean)
     assert teacher.state_dict()["of"]["curriculum"]["score"] == "shortfall"
     prl.Teacher(prl.curricula.plr(score=partial(shortfall)), teacher.space).ask()  # has no name
 

@@ -15,7 +15,7 @@ from proposer_rl.teaching.identity import of_classes
 
 
 def make_curriculum(
-    curriculum: Recipe | Curriculum | str,
+    curriculum: Recipe | Curriculum | type[Curriculum] | str,
     space: Any,
     filter: Mapping[str, Any] | str | None,
     seed: int,
@@ -30,6 +30,8 @@ def make_curriculum(
             f"space={shown(space)}: must be Parameters, Items, LevelGenerator, MadeLevels or a task"
         )
     run = Components(space, ProposerSettings(), seed)
+    if isinstance(curriculum, type):
+        curriculum = curriculum.create(run)
     if isinstance(curriculum, Curriculum):
         named, config = of_classes(curriculum), completed(asked(None, filter))
         made = around(curriculum, config, run)

@@ -67,7 +67,8 @@ class Teacher:
     Whatever is refused counts nothing, and leaves the teacher as it was.
 
     Args:
-        curriculum: ``prl.curricula.NAME(...)``, its name, or a curriculum of one's own.
+        curriculum: ``prl.curricula.NAME(...)``, its name, or a curriculum of one's own or its
+            class, which is then made by its ``create``.
         space: :class:`~proposer_rl.teaching.Parameters`, :class:`~proposer_rl.teaching.Items`,
             :class:`~proposer_rl.teaching.LevelGenerator`, or a task.
         seed: of every random draw.
@@ -107,7 +108,7 @@ class Teacher:
     @checked
     def __init__(
         self,
-        curriculum: Recipe | Curriculum | str,
+        curriculum: Recipe | Curriculum | type[Curriculum] | str,
         space: LevelSpace | Task,
         *,
         seed: SupportsIndex = 0,
