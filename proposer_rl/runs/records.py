@@ -19,6 +19,7 @@ from pydantic import BaseModel, FiniteFloat, TypeAdapter, ValidationError
 
 from proposer_rl.runs.folder import is_rate
 
+ACRONYMS = ("id", "ood")  # in- and out-of-distribution
 LARGEST = 1e100  # what is greater is no measurement, and overflows when it is drawn
 LONGEST_TEXT = 400  # characters of what is shown in a line
 
@@ -146,9 +147,9 @@ def batch_shares(record: Record) -> dict[str, float]:
 
 
 def words(name: str) -> str:
-    """Returns a column's name in words: ``id_success`` is ID success."""
+    """Returns a column's name in words: ID success for ``id_success``, else in lower case."""
     first, _, rest = name.partition("_")
-    first = first.upper() if len(first) <= 3 else first
+    first = first.upper() if first in ACRONYMS else first
     return f"{first} {rest.replace('_', ' ')}".strip()
 
 

@@ -95,8 +95,9 @@ class LevelSpace:
 class Parameters(LevelSpace, ParameterSpace):
     """Levels that are values of named parameters.
 
-    In batches a level is a tensordict with an entry for each parameter, float64 or int64: of other
-    choices than numbers the place in their list. One by one it is a dict of numbers and texts.
+    In batches a level is a tensordict with an entry for each parameter, in torch's default floating
+    dtype or int64: of other choices than numbers the place in their list. One by one it is a dict
+    of numbers and texts.
 
     Args:
         ranges: of each parameter, by name: ``(low, high)`` for a continuous range, ``range(a, b)``
@@ -202,6 +203,11 @@ class Parameters(LevelSpace, ParameterSpace):
             said = f"{low} to {high}{whole}" if part.wide else str(values)
             found[name] = str(part) if isinstance(part, Law) else said
         return found
+
+    def given(self, levels: TensorDictBase) -> TensorDictBase:
+        """Returns levels as loops get them: real numbers in torch's default dtype."""
+        real = torch.get_default_dtype()
+        return levels.apply(lambda one: one.to(real) if one.is_floating_point() else one)
 
     def rows(self, levels: TensorDictBase) -> list[dict[str, Any]]:
         """Returns levels [n] as dicts of numbers and texts."""

@@ -123,6 +123,8 @@ class Teacher:
         self.space, self.device, self.block = space, torch.empty(0, device=device).device, block
         self.id = token_hex(4)
         self._seed = whole("seed", seed)
+        if hasattr(space, "space"):
+            self._like  # noqa: B018  what is wrong with one's own levels is told of these
         self.curriculum, self._made_of = make_curriculum(curriculum, space, filter, self._seed)
         if student is not None and can:
             raise ArgumentError(f"{next(iter(can))}: give it to the student, which is asked alone")
