@@ -93,7 +93,6 @@ WRONG = [
     ("task.maze.max_steps=5", "task.maze.max_steps=5 must be at least 12, the path length of"),
     ("task.network.channels=[12]", "must be divisible by num_groups (8)"),
     ("task.space.path_lengths=[50]", "task.space: cannot make levels with obstacle_fraction=0"),
-    ("task.space.path_lengths=[2,2]", "space: path_lengths must be distinct, got [2, 2]"),
     (
         "task.distributions.ood.specifications=[[0.9,12]]",
         "task.distributions.ood: cannot make levels with",
@@ -360,8 +359,8 @@ def test_a_table_that_was_shortened_is_refused(finished: Path, train, capsys) ->
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"{", "is no JSON of at most 1,000,000 bytes"),
-        (b"[" * 100_000, "no JSON of at most"),
+        (b"{", "is no JSON"),
+        (b"[" * 100_000, "is no JSON"),
         (b"[1]", "started with [1]"),
     ],
 )

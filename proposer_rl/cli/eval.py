@@ -18,7 +18,6 @@ from rich.table import Table
 from rich.text import Text
 
 from proposer_rl.cli.errors import ConfigError, check_file, command, number
-from proposer_rl.report.tables import to_csv
 from proposer_rl.runs.folder import write_atomically
 
 if TYPE_CHECKING:
@@ -101,6 +100,8 @@ def list_levels(options: argparse.Namespace) -> None:
     evaluation = evaluate(load(options.checkpoint), options.levels, options.max_steps)
     _print(evaluation)
     if options.output is not None and options.output.suffix == ".csv":
+        from proposer_rl.report.tables import to_csv  # which takes seconds to import
+
         rows = evaluation.rows()
         table = to_csv(list(rows[0]), [list(row.values()) for row in rows])
         write_atomically(options.output, table.encode())
