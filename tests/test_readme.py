@@ -80,9 +80,13 @@ def test_the_commands_run(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("own_folder")
-def test_the_code_runs() -> None:
+def test_the_code_runs_and_says_what_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    first, *others = blocks("python", README)
     names: dict[str, object] = {}
-    for block in blocks("python", README):
+    exec(first, names)
+    shown = re.search(r"^```\n({'target'.*?\n)```", README, re.MULTILINE)
+    assert shown is not None and capsys.readouterr().out == shown[1]
+    for block in others:
         exec(block, names)
 
 
