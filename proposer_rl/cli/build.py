@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import torch
 
-from proposer_rl import methods
 from proposer_rl.cli.config import RunConfig, task_maker
 from proposer_rl.cli.errors import ConfigError, one_line
 from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, require
@@ -18,6 +17,7 @@ from proposer_rl.learning import PPO, SolverSettings
 from proposer_rl.meta.assembly import Components, Workers
 from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.methods import CANNOT_BE_CALLED
+from proposer_rl.methods import build as build_curriculum
 from proposer_rl.models import available_cores, check_torch_defaults, use_device
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.process import Status, StopSignals
@@ -110,7 +110,7 @@ def _curriculum(
     workers = _workers(config, task)
     run = Components(task, config.proposer, config.seeds, on_update, workers)
     asked = {"curriculum": config.curriculum, "filter": config.filter, "model": config.model}
-    curriculum = methods.build(asked, run)  # one for all seeds
+    curriculum = build_curriculum(asked, run)  # one for all seeds
     learned = isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas
     if workers is not None and not learned:
         raise ConfigError(
