@@ -174,7 +174,8 @@ def _over(known: Mapping[str, Parameter], file: DictConfig) -> dict[str, Paramet
     found = dict(known)
     for name, value in plain_values(file).items():
         default = Parameter.empty if value == "???" else value  # to be given
-        found[name] = Parameter(name, Parameter.KEYWORD_ONLY, default=default)
+        setting = known.get(name, Parameter(name, Parameter.KEYWORD_ONLY))
+        found[name] = setting.replace(default=default)
     found.pop("_target_", None)
     return found
 

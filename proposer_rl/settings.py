@@ -43,6 +43,7 @@ NotNegative = Annotated[float, Ge(0)]
 """Zero, or a number above it."""
 
 
+NAMED = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 SHOULD = "input should be "  # as pydantic begins most of its lines
 
 BY_KIND = Discriminator("kind")
@@ -187,7 +188,7 @@ def check_names(
     known: Mapping[str, inspect.Parameter], values: Mapping[str, Any], missing: bool = True
 ) -> None:
     """Refuses unknown names, and if asked missing ones; see :func:`arguments`."""
-    named = [p for p in known.values() if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+    named = [p for p in known.values() if p.kind in NAMED]
     names = [p.name for p in named]
     takes_any = any(p.kind is p.VAR_KEYWORD for p in known.values())
     for name in values:
@@ -234,16 +235,15 @@ def _checked_values(function: Callable[..., Any], values: Mapping[str, Any]) -> 
 @functools.cache
 def _adapters(function: Callable[..., Any]) -> dict[str, TypeAdapter[Any] | None]:
     cls = function if inspect.isclass(function) else getattr(function, "__self__", None)
-    typed = [function] if not inspect.isclass(cls) else [cls.__init__, function]
-    hints: dict[str, Any] = {}
-    for some in typed:
-        hints |= {} if inspect.isclass(some) else get_type_hints(some, include_extras=True)
-    one_by_one = [
-        name
+    hints = get_type_hints(cls.__init__, include_extras=True) if inspect.isclass(cls) else {}
+    if function is not cls:
+        hints |= get_type_hints(function, include_extras=True)
+    single = {inspect.Parameter.POSITIONAL_ONLY, *NAMED}
+    return {
+        name: _adapter(hints[name])
         for name, p in _parameters(function).items()
-        if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
-    ]
-    return {name: _adapter(hints[name]) for name in one_by_one if name in hints}
+        if p.kind in single and name in hints
+    }
 
 
 def _adapter(hint: Any) -> TypeAdapter[Any] | None:

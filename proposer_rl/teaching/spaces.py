@@ -17,7 +17,7 @@ from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from torch import Tensor
 
 from proposer_rl.models import check_torch_defaults
-from proposer_rl.settings import ArgumentError, plain, shown, whole
+from proposer_rl.settings import ArgumentError, WholeKeyError, plain, shown, whole
 from proposer_rl.task import Distribution, Levels, space_features
 from proposer_rl.tasks.parameters import SEED, Bins, Law, ParameterSpace
 from proposer_rl.tasks.ranges import (
@@ -458,7 +458,7 @@ def _taken(name: str, levels: Any, count: int) -> Levels:
     collection = is_tensor_collection(levels)
     if not (collection or isinstance(levels, Tensor)) or tuple(levels.shape[:1]) != (count,):
         found = list(getattr(levels, "shape", ())) or type(levels).__name__
-        raise ArgumentError(f"{name}={found}: must give a tensor or tensordict of {count} levels")
+        raise WholeKeyError(f"{name}={found}: must give a tensor or tensordict of {count} levels")
     return levels if collection else TensorDict({DRAWN: levels}, [count])
 
 
