@@ -23,6 +23,7 @@ from proposer_rl.runs.records import (
     SampleRecord,
     TaskFacts,
     checked,
+    natural,
     printable,
 )
 
@@ -42,7 +43,7 @@ class OutputError(ValueError):
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:
-    """Returns the folders of runs and studies in some folders, each once, sorted."""
+    """Returns the folders of runs and studies in some folders, each once, as people sort them."""
     found: list[Path] = []
     for folder in folders:
         inside = [
@@ -56,7 +57,8 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
                 f"bin/train writes them, a study's {STUDY}"
             )
         found += inside
-    return sorted({path.resolve(): path for path in found}.values())
+    each_once = {path.resolve(): path for path in found}.values()
+    return sorted(each_once, key=lambda path: [natural(part) for part in path.parts])
 
 
 def begun(folder: Path) -> list[Path]:
@@ -70,7 +72,7 @@ def _walk(folder: Path) -> Iterator[tuple[Path, set[str]]]:
         raise UnreadableRun(f"{folder}: there is no such folder")
     for root, names, files in os.walk(folder):
         # Hidden are those of a study that is being published.
-        names[:] = sorted(name for name in names if not name.startswith("."))
+        names[:] = sorted((n for n in names if not n.startswith(".")), key=natural)
         if {"config.json", STUDY} & set(files):
             names.clear()
         if {"config.json", FAILURE, STUDY} & set(files):

@@ -57,7 +57,8 @@ class TaskFacts(BaseModel):
         title: what it is, as ``6×6 mazes``.
         levels: what a level is called, plural.
         distributions: names of what was measured on.
-        space: of the levels that are chosen from: the values along each axis, by its name.
+        space: of the levels that are chosen from: the values along each axis, numbers or texts,
+            by its name.
         about: further facts, by their label.
         measured: all that must be equal for two runs to be comparable.
         samples: levels of each distribution.
@@ -69,7 +70,7 @@ class TaskFacts(BaseModel):
     title: str
     levels: str = "levels"
     distributions: list[str]
-    space: dict[str, list[FiniteFloat]] = {}
+    space: dict[str, list[FiniteFloat | str]] = {}
     about: dict[str, str] = {}
     measured: Any
     samples: dict[str, list[LevelRecord]] = {}
@@ -105,6 +106,17 @@ def small_json(path: Path, largest: int = 2**20) -> Any:
 def printable(text: str) -> str:
     """Returns a text as one line without control characters."""
     return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+
+
+def natural(text: str) -> list[tuple[float, str]]:
+    """Returns a key that sorts texts by the numbers in them: 0, 1, 10 and 11, not 0, 1, 10, 2.
+
+    Example:
+        >>> sorted(["10_plr", "2_plr", "1_plr"], key=natural)
+        ['1_plr', '2_plr', '10_plr']
+    """
+    parts = re.split(r"(\d+)", text, flags=re.ASCII)
+    return [(float(part), part) if i % 2 else (-1.0, part) for i, part in enumerate(parts)]
 
 
 def encoded(text: str) -> bytes:
@@ -154,9 +166,9 @@ def batch_shares(record: Record) -> dict[str, float]:
 
 
 def words(name: str) -> str:
-    """Returns a column's name in words: ``id_success`` is ID success."""
+    """Returns a column's name in words: ``id_success`` is ID success, as of the mazes."""
     first, _, rest = name.partition("_")
-    first = first.upper() if len(first) <= 3 else first
+    first = first.upper() if first in ("id", "ood") else first
     return f"{first} {rest.replace('_', ' ')}".strip()
 
 

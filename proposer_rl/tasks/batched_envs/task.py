@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Annotated, ClassVar
 
 import torch
@@ -76,7 +75,7 @@ class BatchedTask(Task):
                 "environment": env,
                 "levels": levels,
                 "steps": max_steps,
-                "parameters": {name: asdict(one) for name, one in parameters.items()},
+                "parameters": {name: one.measured for name, one in parameters.items()},
             },
         )
 
