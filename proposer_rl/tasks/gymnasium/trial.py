@@ -50,7 +50,6 @@ def tried(
         ValueError: in a line that names the key, for what cannot be made, set or read.
         ImportError, gymnasium.error.Error: of the environment, if it cannot be made.
     """
-    _check_places(parameters)
     _check_interface(LevelPlayer(make, parameters, target))
     _check_wrappers(make, parameters, target)
     player = LevelPlayer(make, parameters, target, success)
@@ -67,23 +66,8 @@ def tried(
     return limit
 
 
-def _check_places(parameters: Mapping[str, ParameterSettings]) -> None:
-    """Refuses two parameters of which one would undo the other."""
-    taken: dict[tuple[str, str], str] = {}
-    for name, given in parameters.items():
-        for path in given.names(name):
-            other = taken.setdefault((given.set, path), name)
-            if other != name:
-                raise ValueError(f"parameters.{name}: {path} is set by parameters.{other}, too")
-
-
 def _check_interface(player: LevelPlayer) -> None:
     """Lets Gymnasium check the environment; what it cannot do with it is no reason to refuse it."""
-    for name, _ in leaves(player.observation_space):
-        if name.split(".")[-1] == "action_mask":
-            warnings.warn(
-                f"{name}: is shown to the Solver as numbers; actions are not masked", stacklevel=2
-            )
     player.reset()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ADVICE)

@@ -63,8 +63,6 @@ WRONG: list[tuple[dict[str, Any], str]] = [
      r"action space Box.*int64\): there is a policy for .* a Box of floats"),
     ({"env_id": "tests.tasks.gymnasium.broken:Walk-v0", "parameters": {}},
      r"env_id=.*: it cannot be made: ZeroDiv.* \(broken.py, line \d+\)$"),
-    ({"parameters": {n: ParameterSettings(name="wind", values=[1], target=1) for n in "ab"}},
-     "parameters.b: wind is set by parameters.a, too"),
     ({"parameters": {"a,b": PARAMETERS["width"]}}, "parameters.a,b: must be a name of letters"),
     ({"wrappers": ["nowhere.Wrapper"]}, "wrappers: nowhere.Wrapper: .*cannot be imported"),
     ({"arguments": {"foo": 1}}, "parameters: .*refuses .*unexpected keyword"),
