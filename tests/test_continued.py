@@ -70,7 +70,7 @@ class Kept(Curriculum):
 
 def played(level: TensorDictBase, actions: list[int]) -> tuple[float, bool]:
     """Return and success of an episode on a level [1], by the environment alone."""
-    (play,) = plays(level)
+    (play,) = plays(level, PARAMETERS)
     player = LevelPlayer(TASK._make, PARAMETERS, play)
     player.reset()
     total = 0.0

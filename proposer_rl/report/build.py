@@ -59,8 +59,9 @@ def read_checked(
     """Returns the studies of the runs in some folders and notes; see :func:`write_report`."""
     first, found = next(iter(baselines), None), find_runs(folders)
     studies, notes = read_studies(found, threshold, first, compare)
-    unmeasured = {path for folder in folders for path in begun(folder)} - {*found}
-    notes += [f"not read: {path.name}: it has measured nothing" for path in sorted(unmeasured)]
+    every = dict.fromkeys(path for folder in folders for path in begun(folder))
+    unmeasured = [path for path in every if path not in found]
+    notes += [f"not read: {path.name}: it has measured nothing" for path in unmeasured]
     labels = sorted({group.label for study in studies for group in study.compared})
     for option, given in (("baseline", baselines), ("compare", compare)):
         for label in given:

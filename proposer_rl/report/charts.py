@@ -160,7 +160,7 @@ def _stages(study: Study) -> dict[str, Json] | None:
         return None
     proposed = [number for number, method in shown.items() if method["stages"][-1]["map"]]
     axes = [
-        {"name": name, "values": plain(values)}
+        {"name": name, "values": [v if isinstance(v, str) else plain([v])[0] for v in values]}
         for name, values in list(like.task.space.items())[:2]
     ]
     return {

@@ -330,10 +330,11 @@ def _draw_maps(
     bar.ax.tick_params(labelsize=7)
 
 
-def _ticks(values: Sequence[float]) -> tuple[Column, list[str]]:
+def _ticks(values: Sequence[float | str]) -> tuple[Column, list[str]]:
     """Places and texts of an axis' values, or of some of them where they are many."""
     step = -(-len(values) // MOST_TICKS)
-    return np.arange(0.5, len(values), step), [f"{value:g}" for value in values[::step]]
+    texts = [value if isinstance(value, str) else f"{value:g}" for value in values[::step]]
+    return np.arange(0.5, len(values), step), texts
 
 
 def _histograms(group: Group) -> tuple[Column, Column] | None:

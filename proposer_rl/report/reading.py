@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +23,7 @@ from proposer_rl.runs.records import (
     SampleRecord,
     TaskFacts,
     checked,
+    natural,
     printable,
 )
 
@@ -43,7 +43,7 @@ class OutputError(ValueError):
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:
-    """Returns the folders of runs and studies in some folders, each once, sorted."""
+    """Returns the folders of runs and studies in some folders, each once, as people sort them."""
     found: list[Path] = []
     for folder in folders:
         inside = [
@@ -57,18 +57,8 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
                 f"bin/train writes them, a study's {STUDY}"
             )
         found += inside
-    return sorted({path.resolve(): path for path in found}.values(), key=in_order)
-
-
-def in_order(path: str | Path) -> list[tuple[bool, int, str]]:
-    """Returns a key by which paths are sorted as people count: 0, 1, 10 after 2.
-
-    Example:
-        >>> sorted(["seed=10", "seed=9", "a"], key=in_order)
-        ['a', 'seed=9', 'seed=10']
-    """
-    parts = re.split(r"(\d+)", str(path))
-    return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in parts]
+    each_once = {path.resolve(): path for path in found}.values()
+    return sorted(each_once, key=lambda path: [natural(part) for part in path.parts])
 
 
 def begun(folder: Path) -> list[Path]:
@@ -82,7 +72,7 @@ def _walk(folder: Path) -> Iterator[tuple[Path, set[str]]]:
         raise UnreadableRun(f"{folder}: there is no such folder")
     for root, names, files in os.walk(folder):
         # Hidden are those of a study that is being published.
-        names[:] = sorted((name for name in names if not name.startswith(".")), key=in_order)
+        names[:] = sorted((n for n in names if not n.startswith(".")), key=natural)
         if {"config.json", STUDY} & set(files):
             names.clear()
         if {"config.json", FAILURE, STUDY} & set(files):

@@ -16,7 +16,7 @@ import numpy as np
 from proposer_rl.report.reading import UnreadableRun, read_run
 from proposer_rl.report.runs import Run
 from proposer_rl.report.style import Look, looks
-from proposer_rl.runs.records import Column
+from proposer_rl.runs.records import Column, natural
 
 USUAL_BASELINE = "domain_randomization"
 LONGEST_LABEL = 40  # characters of the settings in a label
@@ -275,7 +275,7 @@ def _groups(runs: Sequence[Run]) -> tuple[Group, ...]:
         for plain, alike in named.items()
         for (label, setting), members in zip(_labels(plain, alike), alike, strict=True)
     ]
-    return tuple(sorted(groups, key=lambda group: group.label))
+    return tuple(sorted(groups, key=lambda group: natural(group.label)))
 
 
 def _plain_label(run: Run) -> str:
@@ -300,7 +300,7 @@ def _labels(plain: str, alike: Sequence[Sequence[Run]]) -> list[tuple[str, str]]
     else:
         settings = _differing([dict(_leaves(_variant(members[0]))) for members in alike])
         texts = [f"{plain} ({setting})" for setting in settings]
-    order = sorted(range(len(alike)), key=settings.__getitem__)
+    order = sorted(range(len(alike)), key=lambda i: natural(settings[i]))
     short = max(map(len, settings)) <= LONGEST_LABEL
     return [
         (texts[i] if short else f"{plain} #{order.index(i) + 1}", setting)

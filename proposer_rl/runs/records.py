@@ -58,7 +58,8 @@ class TaskFacts(BaseModel):
         title: what it is, as ``6×6 mazes``.
         levels: what a level is called, plural.
         distributions: names of what was measured on.
-        space: of the levels that are chosen from: the values along each axis, by its name.
+        space: of the levels that are chosen from: the values along each axis, numbers or texts,
+            by its name.
         about: further facts, by their label.
         measured: all that must be equal for two runs to be comparable.
         samples: levels of each distribution.
@@ -70,7 +71,7 @@ class TaskFacts(BaseModel):
     title: str
     levels: str = "levels"
     distributions: list[str]
-    space: dict[str, list[FiniteFloat]] = {}
+    space: dict[str, list[FiniteFloat | str]] = {}
     about: dict[str, str] = {}
     measured: Any
     samples: dict[str, list[LevelRecord]] = {}
@@ -106,6 +107,17 @@ def small_json(path: Path) -> Any:
 def printable(text: str) -> str:
     """Returns a text as one line without control characters."""
     return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+
+
+def natural(text: str) -> list[tuple[float, str]]:
+    """Returns a key that sorts texts by the numbers in them: 0, 1, 10 and 11, not 0, 1, 10, 2.
+
+    Example:
+        >>> sorted(["10_plr", "2_plr", "1_plr"], key=natural)
+        ['1_plr', '2_plr', '10_plr']
+    """
+    parts = re.split(r"(\d+)", text, flags=re.ASCII)
+    return [(float(part), part) if i % 2 else (-1.0, part) for i, part in enumerate(parts)]
 
 
 def encoded(text: str) -> bytes:
@@ -147,7 +159,7 @@ def batch_shares(record: Record) -> dict[str, float]:
 
 
 def words(name: str) -> str:
-    """Returns a column's name in words: ID success for ``id_success``, else in lower case."""
+    """Returns a column's name in words: ``id_success`` is ID success, as of the mazes."""
     first, _, rest = name.partition("_")
     first = first.upper() if first in ACRONYMS else first
     return f"{first} {rest.replace('_', ' ')}".strip()

@@ -319,10 +319,16 @@ class Task(ABC):
     def training_metrics(self, levels: Levels, rollout: TensorDictBase) -> TensorDictBase:
         """Returns what Solvers trained on, levels [K, P] and rollout [K, P, T], by name, each [K].
 
-        The columns of ``training.csv``: here means of the entries that are axes of the space, and
-        of the first episodes' success and return.
+        The columns of ``training.csv``: here means of the entries that are axes of the space, of
+        texts the share of each, and means of the first episodes' success and return.
         """
-        means = {name: levels[name].double().mean(-1) for name in self._numbers(levels)}
+        means: dict[str, Tensor] = {}
+        bins = getattr(self.space, "bins", {})
+        for name in self._numbers(levels):
+            if name in bins:
+                means |= bins[name].means(name, levels[name])
+            else:
+                means[name] = levels[name].double().mean(-1)
         if "success" in self.results:
             means["train_success"] = first_episode_success(rollout).float().mean(-1)
         means["train_return"] = first_episode_return(rollout).mean(-1) / self.reward_scale

@@ -15,7 +15,7 @@ OF_GYMNASIUM = "gymnasium"  # the file of any environment of Gymnasium; a folder
 
 
 def from_gymnasium(env_id: str, **settings: Any) -> Recipe:
-    """Returns a task of any environment of Gymnasium, some of whose numbers make a level.
+    """Returns a task of any environment of Gymnasium, some of whose settings make a level.
 
     Args:
         env_id: such as ``"CartPole-v1"``; ``"module:name"`` imports the module first.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Annotated, ClassVar, NamedTuple
 
 import torch
@@ -300,7 +299,7 @@ class BatchedTask(Task):
                 "environment": env,
                 "levels": levels,
                 "steps": max_steps,
-                "parameters": {name: asdict(one) for name, one in parameters.items()},
+                "parameters": {name: one.measured for name, one in parameters.items()},
             },
         )
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -29,25 +31,56 @@ class Bins:
     Attributes:
         low, high: ends of each part, float64 or int64 [n]; equal where the part is a single value.
             Whole numbers are drawn with both ends.
+        log: whether values are drawn, moved and compared by their logarithms.
     """
 
     low: Tensor
     high: Tensor
+    log: bool = field(default=False, kw_only=True)
 
     @property
-    def middles(self) -> list[Number]:
+    def middles(self) -> list[Any]:
         """Returns the value that stands for each part."""
-        return ((self.low + self.high) / 2).tolist() if self.wide else self.low.tolist()
+        return self.off_scale(self.centres).tolist() if self.wide else self.low.tolist()
+
+    def on_scale(self, values: Tensor) -> Tensor:
+        """Returns values as they are, or their logarithms where the scale is a logarithmic one."""
+        return values.double().clamp_min(0).log() if self.log else values
+
+    def off_scale(self, places: Tensor) -> Tensor:
+        """Returns the values of places on the scale; see :meth:`on_scale`."""
+        return places.exp().clamp(self.low[0], self.high[-1]) if self.log else places
+
+    def named(self, values: Tensor) -> list[Any]:
+        """Returns values [n] of levels as a loop gets them: numbers, or what they stand for."""
+        return values.tolist()
+
+    def means(self, name: str, values: Tensor) -> dict[str, Tensor]:
+        """Returns the mean of values [K, P] on the scale, [K], by the parameter's name."""
+        return {name: self.off_scale(self.on_scale(values.double()).mean(-1))}
+
+    @property
+    def texts(self) -> list[str]:
+        """Returns the names of the parts, in as many digits as tell them apart."""
+        ends = [*zip(self.low.tolist(), self.high.tolist(), strict=True)]
+        for digits in (4, 17):
+            texts = [
+                f"{a:.{digits}g}" if a == b else f"{a:.{digits}g} to {b:.{digits}g}"
+                for a, b in ends
+            ]
+            if len({*texts}) == len(texts):
+                break
+        return texts
 
     @cached_property
     def wide(self) -> bool:
         """Returns whether the parts are more than single values."""
         return bool((self.high > self.low).any())
 
-    @cached_property
-    def ends(self) -> tuple[Number, Number]:
-        """Returns the lowest and the highest value of all parts."""
-        return self.low[0].item(), self.high[-1].item()
+    @property
+    def centres(self) -> Tensor:
+        """Returns the middle of each part on the scale, float64 [n]."""
+        return (self.on_scale(self.low) + self.on_scale(self.high)).double() / 2
 
     @cached_property
     def borders(self) -> Tensor:
@@ -56,10 +89,10 @@ class Bins:
 
     @cached_property
     def scale(self) -> tuple[float, float]:
-        """Returns the value that lies at -1, and how far from it the one at 1 lies."""
-        ends = (self.low + self.high).double() / 2
+        """Returns the place on the scale that lies at -1, and how far from it the one at 1 lies."""
+        ends = self.centres
         if len(ends) == 1:
-            ends = torch.cat([self.low, self.high]).double()
+            ends = self.on_scale(torch.cat([self.low, self.high])).double()
         return float(ends[0]), float(ends[-1] - ends[0])
 
     def draw(self, index: Tensor, generator: torch.Generator) -> Tensor:
@@ -69,20 +102,23 @@ class Bins:
             return low
         share = torch.rand(len(index), generator=generator, dtype=torch.float64)
         if low.is_floating_point():
-            return low.lerp(high, share)
+            inside = self.on_scale(low).lerp(self.on_scale(high), share)
+            return inside.exp().clamp(low, high) if self.log else inside
         return low + (share * (high - low + 1)).long()
 
     def at(self, share: Tensor) -> Tensor:
         """Returns the values at shares of the whole range, float64 [*B] from 0 to 1: [*B]."""
         if self.wide and self.low.is_floating_point():
-            return self.low[0].lerp(self.high[-1], share)
+            low, high = self._ends
+            return self.off_scale(low.lerp(high, share))
         values = torch.arange(int(self.low[0]), int(self.high[-1]) + 1) if self.wide else self.low
         return values[(share * len(values)).long().clamp(max=len(values) - 1)]
 
     def share(self, values: Tensor) -> Tensor:
         """Returns a share of the range at which :meth:`at` gives each value, float64 [*B]: [*B]."""
         if self.wide and self.low.is_floating_point():
-            return (values.double() - self.low[0]) / (self.high[-1] - self.low[0])
+            low, high = self._ends
+            return (self.on_scale(values.double()) - low) / (high - low)
         if self.wide:
             return (values - self.low[0] + 0.5) / (self.high[-1] - self.low[0] + 1)
         return (torch.searchsorted(self.low, values) + 0.5) / len(self.low)
@@ -96,9 +132,10 @@ class Bins:
             line = self.low.double()
             place = (line - old.unsqueeze(-1)).abs().argmin(-1)
             return self.low[(place + _one_at_least(noise, len(line))).clamp(0, len(line) - 1)]
-        low, high = self.low[0], self.high[-1]
+        low, high = self._ends
         if self.low.is_floating_point():
-            return (old + noise * STEP * (high - low)).clamp(low, high)
+            moved = self.on_scale(old) + noise * STEP * (high - low)
+            return self.off_scale(moved.clamp(low, high))
         return (old + _one_at_least(noise, float(high - low))).clamp(low, high)
 
     def between(self, a: Tensor, b: Tensor, share: Tensor, noise: Tensor) -> Tensor:
@@ -112,33 +149,27 @@ class Bins:
             last = len(self.low) - 1
             place = start.lerp(end, share) + noise * last
             return self.low[place.round().long().clamp(0, last)]
-        low, high = self.ends
-        value = a.double().lerp(b.double(), share) + noise * (high - low)
-        return (value if self.low.is_floating_point() else value.round()).to(a).clamp(low, high)
-
-    def scaled(self, values: Tensor) -> Tensor:
-        """Returns where values float64 [*B] lie, -1 and 1 being the first and last middle: [*B].
-
-        If there is one part alone, -1 and 1 are its ends; a single value lies at 0.
-        """
-        first, reach = self.scale
-        return 2 * (values - first) / reach - 1 if reach > 0 else 0 * values
+        low, high = (end.item() for end in self._ends)
+        start, end = (self.on_scale(one.double()) for one in (a, b))
+        value = start.lerp(end, share) + noise * (high - low)
+        value = (value if self.low.is_floating_point() else value.round()).to(a).clamp(low, high)
+        return self.off_scale(value)
 
     def columns(self, values: Tensor, scaled: Tensor) -> Tensor:
         """Returns what a belief knows of values [*B], numbers of -1 to 1: float64 [*B, c].
 
         Args:
             values: on the CPU.
-            scaled: where they lie, see :meth:`scaled`.
+            scaled: where they lie, see :meth:`ParameterSpace.locate`.
         """
         return scaled.unsqueeze(-1)
 
     def below(self, ends: Tensor) -> Tensor:
         """Returns the probability of a value of at most each of some ends, float64 [n]."""
-        low, high = self.low.double(), self.high.double()
+        low, high = (self.on_scale(end).double() for end in (self.low, self.high))
         if self.wide and not self.low.is_floating_point():  # a whole number is an interval of one
             low, high = low - 0.5, high + 0.5
-        beyond = ends.double().unsqueeze(-1) - low
+        beyond = self.on_scale(ends.double()).unsqueeze(-1) - low
         inside = (beyond / (high - low)).clamp(0, 1)
         return torch.where(high > low, inside, (beyond >= 0).double()).mean(-1)
 
@@ -151,9 +182,15 @@ class Bins:
         ends = of.below(self.borders)
         return torch.cat([torch.zeros(1), ends, torch.ones(1)]).diff()
 
+    @cached_property
+    def _ends(self) -> tuple[Tensor, Tensor]:
+        """Returns the lowest and the highest place of all parts on the scale."""
+        return self.on_scale(self.low[0]), self.on_scale(self.high[-1])
+
     def __str__(self) -> str:
         ends = zip(self.low.tolist(), self.high.tolist(), strict=True)
-        return " or ".join(f"{a:g}" if a == b else f"{a:g} to {b:g}" for a, b in ends)
+        text = " or ".join(f"{a:g}" if a == b else f"{a:g} to {b:g}" for a, b in ends)
+        return f"{text} (log scale)" if self.log and self.wide else text
 
 
 @dataclass(frozen=True)
@@ -199,18 +236,22 @@ def points(values: Sequence[Number], key: str = "values") -> Bins:
     return Bins(line, line)
 
 
-def intervals(low: float, high: float, count: int = 1) -> Bins:
-    """Returns equal parts of a range, within which values are uniform.
+def intervals(low: float, high: float, count: int = 1, log: bool = False) -> Bins:
+    """Returns equal parts of a range, within which values are uniform, or their logarithms are.
 
     Raises:
-        ValueError: if the range is none, or goes beyond float32.
+        ValueError: if the range is none, or goes beyond float32, or to 0 on a logarithmic scale.
     """
     if not -LARGEST <= low < high <= LARGEST:
         raise ValueError(
             f"low={low} must be below high={high}, and both finite, at most {LARGEST:g} in size"
         )
+    if log and low <= 0:
+        raise ValueError(f"low={low}: must be above 0 on a logarithmic scale")
     edges = torch.linspace(low, high, count + 1, dtype=torch.float64)
-    return Bins(edges[:-1], edges[1:])
+    if log:
+        edges = torch.from_numpy(np.geomspace(low, high, count + 1))
+    return Bins(edges[:-1], edges[1:], log=log)
 
 
 class ParameterSpace:
@@ -256,7 +297,7 @@ class ParameterSpace:
     @property
     def coordinates(self) -> Tensor:
         """Returns where bins lie, [N, D]: -1 to 1 along each axis, 0 on one of a single bin."""
-        lines = [part.scaled((part.low + part.high).double() / 2) for part in self.bins.values()]
+        lines = [_unit(part.centres, *part.scale) for part in self.bins.values()]
         if not lines:
             return torch.zeros(1, 0)
         return torch.cartesian_prod(*lines).reshape(self.size, len(lines)).float()
@@ -279,9 +320,8 @@ class ParameterSpace:
         """Returns where levels [*B] lie along each axis, float64 [*B, D] on the CPU."""
         if not self.bins:
             return torch.zeros(*levels.batch_size, 0, dtype=torch.float64)
-        values = torch.stack([levels[name].double() for name in self.bins], -1).cpu()
-        first, reach = self._scales
-        return torch.where(reach > 0, 2 * (values - first) / reach - 1, 0 * values)
+        lines = [part.on_scale(levels[name].double()) for name, part in self.bins.items()]
+        return _unit(torch.stack(lines, -1).cpu(), *self._scales)
 
     def items(self, levels: TensorDictBase) -> Tensor | None:
         """Returns the bins of levels [*B] that are single values, int64 [*B] on the CPU, or None.
@@ -392,6 +432,11 @@ class ParameterSpace:
             return {}
         ends = self._seeds.start, self._seeds.stop
         return {SEED: torch.randint(*ends, shape, generator=generator)}
+
+
+def _unit(places: Tensor, first: Tensor | float, reach: Tensor | float) -> Tensor:
+    """Returns where places [*B] lie, -1 being the first, and 1 at its reach; 0 without a reach."""
+    return torch.where(torch.as_tensor(reach) > 0, 2 * (places - first) / reach - 1, 0 * places)
 
 
 def _one_at_least(noise: Tensor, reach: float) -> Tensor:

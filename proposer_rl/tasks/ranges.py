@@ -8,7 +8,7 @@ A parameter is a continuous range, whole numbers, or choices; :func:`read_line` 
 import re
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from numbers import Real
 from typing import Annotated, Any, Literal
 
@@ -43,27 +43,31 @@ class LineSettings:
     parts, within which it is drawn uniformly.
 
     Attributes:
-        values: rising numbers, whole if all are; or texts, in any order.
+        values: rising numbers, whole if all are; or texts, truth values and the like, in any order.
         low, high, bins: of a range.
+        log: whether the logarithms of its numbers are what is uniform, cut into equal parts,
+            interpolated and compared.
     """
 
     values: Annotated[list[Any], Len(1, MOST_BINS)] | None = None
     low: float | None = None
     high: float | None = None
     bins: Annotated[int, Ge(1), Le(MOST_BINS)] | None = None
+    log: bool = False
 
     def space_bins(self, count: int = 1) -> Bins:
         """Returns the bins, of a range as many as are given where it does not say how many.
 
         Raises:
-            ValueError: if it has neither values nor a range, both, or they do not rise.
+            ValueError: if it has neither values nor a range, both, or they do not rise, or are not
+                above 0 on a logarithmic scale.
         """
         low, high, bins = self.low, self.high, self.bins
         if self.values is not None and (low, high, bins) == (None, None, None):
-            return choice_bins(self.values)
+            return choice_bins(self.values, self.log)
         if self.values is not None or low is None or high is None:
             raise ValueError("needs either values, or low, high and perhaps bins")
-        return intervals(low, high, bins or count)
+        return intervals(low, high, bins or count, self.log)
 
 
 @settings
@@ -89,16 +93,68 @@ class RangeSettings(LineSettings):
         line = self.space_bins()
         return read_part("target", target_in_file(self.target, line), line)
 
+    @property
+    def measured(self) -> dict[str, Any]:
+        """Returns what must be equal for measurements to be comparable."""
+        # Runs from before there was `log` are comparable where it is not used.
+        return {key: value for key, value in asdict(self).items() if key != "log" or value}
+
+
+@dataclass(frozen=True)
+class Log:
+    """A continuous range on a logarithmic scale, for :class:`~proposer_rl.Parameters`.
+
+    Its bins are equal in ratio, draws in a bin are log-uniform, and small edits, interpolation and
+    what a belief sees go by the logarithm.
+
+    Attributes:
+        low: above 0.
+        high: above that.
+
+    Example:
+        >>> import proposer_rl as prl
+        >>> prl.Parameters({"friction": prl.Log(0.01, 1)}, bins=4).bins["friction"].texts
+        ['0.01 to 0.03162', '0.03162 to 0.1', '0.1 to 0.3162', '0.3162 to 1']
+    """
+
+    low: float
+    high: float
+
 
 @dataclass(frozen=True)
 class Labelled(Bins):
-    """The places of texts, or whatever else is chosen from, in their list, which has no order."""
+    """The places of texts, or whatever else is chosen from, in their list, which has no order.
+
+    Attributes:
+        labels: all that is chosen from.
+    """
 
     labels: list[Any]
+
+    @property
+    def middles(self) -> list[Any]:
+        """Returns the label of each part, as a text."""
+        return [" ".join(str(label).split()) for label in self.named(self.low)]
+
+    def named(self, values: Tensor) -> list[Any]:
+        """Returns the labels at places [n]."""
+        return [self.labels[place] for place in values.tolist()]
+
+    @property
+    def texts(self) -> list[str]:
+        """Returns the labels as texts, with their places where two are alike."""
+        texts = self.middles
+        alike = len({*texts}) < len(texts)
+        return [f"{place}: {text}" for place, text in enumerate(texts)] if alike else texts
 
     def between(self, a: Tensor, b: Tensor, share: Tensor, noise: Tensor) -> Tensor:
         """Returns one of two choices each: b in so many of all draws as the share says."""
         return torch.where(share < 0.5, a, b)
+
+    def means(self, name: str, values: Tensor) -> dict[str, Tensor]:
+        """Returns the share of each label among values [K, P], [K], by the names of both."""
+        shares = one_hot(values, len(self.labels)).double().mean(-2)
+        return {f"{name}={text}": shares[..., i] for i, text in enumerate(self.texts)}
 
     def columns(self, values: Tensor, scaled: Tensor) -> Tensor:
         """Returns which of the listed values [*B] are, 1 or 0: float64 [*B, c]."""
@@ -110,18 +166,25 @@ class Labelled(Bins):
         further = 1 + (noise.abs() * 1e6).long() % max(count - 1, 1)
         return (old + further) % count
 
+    def __str__(self) -> str:
+        return " or ".join(self.middles)
 
-def choice_bins(values: list[Any]) -> Bins:
+
+def choice_bins(values: list[Any], log: bool = False) -> Bins:
     """Returns a bin for each of some rising numbers, or of whatever else there is to choose from.
 
     Raises:
-        ValueError: for numbers that do not rise, or are too large; for a text that comes twice.
+        ValueError: for numbers that do not rise, or are too large; for a text or a truth value that
+            comes twice; for a logarithmic scale of what is not above 0.
     """
-    if all(map(is_real, values)):
-        return points(values)
-    texts = [value for value in values if isinstance(value, str)]
-    if len({*texts}) < len(texts):
-        raise ValueError("must have each text once")
+    numbers = all(map(is_real, values))
+    if log and not (numbers and values[0] > 0):
+        raise ValueError(f"log=True: needs numbers above 0, not values={shown(values)}")
+    if numbers:
+        return replace(points(values), log=log)
+    simple = [value for value in values if isinstance(value, str | int | float)]
+    if len({*simple}) < len(simple):
+        raise ValueError(f"values={shown(values)}: must have each once")
     places = torch.arange(len(values))
     return Labelled(places, places, values)
 
@@ -131,8 +194,9 @@ def read_line(key: str, given: Any, count: int = 1) -> Bins:
 
     Args:
         key: of the parameter, for errors.
-        given: ``(low, high)`` for a continuous range; ``range(a, b)`` for whole numbers; a list or
-            an array of choices; or a mapping with the entries of :class:`LineSettings`.
+        given: ``(low, high)`` for a continuous range, or :class:`Log`; ``range(a, b)`` for whole
+            numbers; a list or an array of choices; or a mapping with the entries of
+            :class:`LineSettings`.
         count: equal parts of a range.
 
     Raises:
@@ -148,6 +212,8 @@ def read_line(key: str, given: Any, count: int = 1) -> Bins:
             edges = torch.linspace(given.start, given.stop, count + 1, dtype=torch.float64)
             low = edges[:-1].ceil().long()
             return Bins(low, torch.cat([low[1:], torch.tensor([given.stop])]) - 1)
+        if isinstance(given, Log):
+            return intervals(float(given.low), float(given.high), count, log=True)
         if isinstance(given, tuple) and len(given) == 2 and all(map(is_real, given)):
             return intervals(float(given[0]), float(given[1]), count)
         if isinstance(given, list | range) and len(given):
@@ -180,12 +246,13 @@ def read_part(key: str, given: Any, line: Bins) -> Bins:
         except ArgumentError as error:
             raise ArgumentError(f"{key}.{error}") from error
     if isinstance(line, Labelled):
-        chosen = given if isinstance(given, list) else [given]
+        chosen = given if isinstance(given, list) and given not in line.labels else [given]
         if not chosen or any(
             value not in line.labels or chosen.count(value) > 1 for value in chosen
         ):
             raise ArgumentError(f"{key}={given!r}: must be among {line.labels}, each once")
-        return points(sorted(map(line.labels.index, chosen)))
+        places = torch.tensor(sorted(map(line.labels.index, chosen)))
+        return replace(line, low=places, high=places)
     many = [given] if is_real(given) else given
     if isinstance(many, list) and not all(map(is_real, many)):
         raise ArgumentError(f"{key}={shown(given)}: must be a number, (from, to) or a list of them")
@@ -194,7 +261,9 @@ def read_part(key: str, given: Any, line: Bins) -> Bins:
         raise ArgumentError(
             f"{key}={given}: must be whole, as the range is: one, a list or range(from, to + 1)"
         )
-    part = Bins(part.low.to(line.low), part.high.to(line.high))
+    part = Bins(part.low.to(line.low), part.high.to(line.high), log=part.log or line.log)
+    if part.log and part.low[0] <= 0:
+        raise ArgumentError(f"{key}={shown(given)}: must be above 0 on a logarithmic scale")
     if not line.wide and (part.wide or not torch.isin(part.low, line.low).all()):
         raise ArgumentError(f"{key}={given}: must be among {line.low.tolist()}")
     return part
@@ -312,6 +381,11 @@ def python_values(given: Any) -> Any:
 def is_real(value: Any) -> bool:
     """Returns whether a value is a number, which a truth value is not."""
     return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def value_text(value: Any, digits: int = 6) -> str:
+    """Returns a value of a parameter as it is shown: a number in so many digits, else a text."""
+    return f"{value:.{digits}g}" if is_real(value) else str(value)
 
 
 def _text(value: Any) -> str:

@@ -1,5 +1,6 @@
 """Curricula in loops of one's own: a teacher, spaces of levels, TorchRL, Gymnasium, data sets."""
 
+from proposer_rl.tasks.ranges import Log as Log
 from proposer_rl.teaching.gymnasium import TaughtEnv as TaughtEnv
 from proposer_rl.teaching.remote import TeacherClient as TeacherClient
 from proposer_rl.teaching.robots import LevelTerm as LevelTerm

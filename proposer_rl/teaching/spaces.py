@@ -100,11 +100,12 @@ class Parameters(LevelSpace, ParameterSpace):
     of numbers and texts.
 
     Args:
-        ranges: of each parameter, by name: ``(low, high)`` for a continuous range, ``range(a, b)``
-            for whole numbers, a list or an array for choices among rising numbers, or among texts.
-            Or what task files have: ``{"low", "high", "bins", "target"}`` or ``{"values",
-            "target"}``. YAML and JSON have no tuples: their ``[5.0, 25.0]`` is two choices, but as
-            the target of such a mapping a range.
+        ranges: of each parameter, by name: ``(low, high)`` for a continuous range, ``prl.Log(low,
+            high)`` for one on a logarithmic scale, ``range(a, b)`` for whole numbers, a list or an
+            array for choices among rising numbers, or among texts. Or what task files have:
+            ``{"low", "high", "bins", "log", "target"}`` or ``{"values", "target"}``. YAML and JSON
+            have no tuples: their ``[5.0, 25.0]`` is two choices, but as the target of such a
+            mapping a range.
         bins: equal parts of a range that curricula tell apart; one number for all, or by name. Of
             twenty parameters or more, 1.
         target: what is to be mastered, for some of the parameters, by name: values, or a part of
@@ -194,14 +195,12 @@ class Parameters(LevelSpace, ParameterSpace):
         """Returns each parameter's values as a text."""
         found = {}
         for name, part in parts.items():
-            labels, values = self.labels[name], part.low.tolist()
-            if labels is not None:
-                values = [str(labels[place]) for place in values]
             ends = part.low[0].item(), part.high[-1].item()
             low, high = (str(end).removesuffix(".0") for end in ends)
-            whole = "" if part.low.is_floating_point() else ", whole"
-            said = f"{low} to {high}{whole}" if part.wide else str(values)
-            found[name] = str(part) if isinstance(part, Law) else said
+            kind = "" if part.low.is_floating_point() else ", whole"
+            said = f"{low} to {high}{kind}" if part.wide else str(part.middles)
+            log = ", log scale" if part.log else ""
+            found[name] = str(part) if isinstance(part, Law) else said + log
         return found
 
     def given(self, levels: TensorDictBase) -> TensorDictBase:
@@ -211,10 +210,10 @@ class Parameters(LevelSpace, ParameterSpace):
 
     def rows(self, levels: TensorDictBase) -> list[dict[str, Any]]:
         """Returns levels [n] as dicts of numbers and texts."""
-        columns = {str(name): entry.tolist() for name, entry in levels.items()}
-        for name, labels in self.labels.items():
-            if labels is not None:
-                columns[name] = [labels[place] for place in columns[name]]
+        columns = {
+            str(name): self.bins[name].named(entry) if name in self.bins else entry.tolist()
+            for name, entry in levels.items()
+        }
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
     def _part(self, key: str, ranges: Ranges) -> dict[str, Bins]:

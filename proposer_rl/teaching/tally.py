@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from proposer_rl.task import Levels
-from proposer_rl.tasks.parameters import Bins, ParameterSpace
+from proposer_rl.tasks.parameters import ParameterSpace
 from proposer_rl.teaching.spaces import Items
 
 MOST_PARTS = 64  # of a data set, whose items are counted in
@@ -98,11 +98,7 @@ class Tally:
 def _bin_texts(space: Any) -> dict[str, list[str]]:
     """Returns the names of the bins of each axis; nothing where there are no bins."""
     if isinstance(space, ParameterSpace):
-        labels = getattr(space, "labels", {})
-        return {
-            name: _distinct(part) if labels.get(name) is None else _label_texts(labels[name])
-            for name, part in space.bins.items()
-        }
+        return {name: part.texts for name, part in space.bins.items()}
     if isinstance(space, Items):
         parts = _parts(space)
         ends = [-(-space.size * part // parts) for part in range(parts + 1)]
@@ -111,25 +107,6 @@ def _bin_texts(space: Any) -> dict[str, list[str]]:
     if not hasattr(type(space), "locate") or space.size > MOST_BINS:
         return {}
     return {name: [f"{value:g}" for value in values] for name, values in space.axes.items()}
-
-
-def _distinct(part: Bins) -> list[str]:
-    """Returns names of bins in as many digits as tell them apart."""
-    ends = [*zip(part.low.tolist(), part.high.tolist(), strict=True)]
-    for digits in (4, 17):
-        texts = [
-            f"{a:.{digits}g}" if a == b else f"{a:.{digits}g} to {b:.{digits}g}" for a, b in ends
-        ]
-        if len({*texts}) == len(texts):
-            break
-    return texts
-
-
-def _label_texts(labels: list[Any]) -> list[str]:
-    """Returns names of choices, with their places where two are alike."""
-    texts = [*map(str, labels)]
-    alike = len({*texts}) < len(texts)
-    return [f"{place}: {text}" for place, text in enumerate(texts)] if alike else texts
 
 
 def _parts(space: Items) -> int:

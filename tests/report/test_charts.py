@@ -147,8 +147,9 @@ def test_stages_move_proposals_levels_and_success_together(tmp_path: Path) -> No
     maps = [[[6, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 3, 3]]]
     cycles = [cycle(i, [0.1], maps[i], every=20) for i in range(2)]
     curve = [0.0, 0.2, 0.4, 0.6]
-    write_run(tmp_path / "p", "perf_gain", [4], curve, cycles=cycles)
-    write_run(tmp_path / "t", "target", [4], curve)
+    task = {**TASK, "space": {"ground": ["flat", "stairs"], "path length": [2, 3, 4]}}
+    write_run(tmp_path / "p", "perf_gain", [4], curve, cycles=cycles, task=task)
+    write_run(tmp_path / "t", "target", [4], curve, task=task)
     (data,) = page_data(write_report([tmp_path], tmp_path / "out", progress=False))
     found, plain = data["stages"]["methods"]
     assert found["curve"] == [[0, 10, 20, 30], curve]
@@ -162,7 +163,7 @@ def test_stages_move_proposals_levels_and_success_together(tmp_path: Path) -> No
     assert found["stages"][0]["levels"] == [0, 0, 0] == plain["stages"][2]["levels"]
     assert data["stages"]["first"] == 0
     axes = {axis["name"]: axis["values"] for axis in data["stages"]["axes"]}
-    assert axes == {"obstacle fraction": [0, 0.2], "path length": [2, 3, 4]}
+    assert axes == {"ground": ["flat", "stairs"], "path length": [2, 3, 4]}
     # Without levels, as in a published study, the map moves alone.
     (tmp_path / "p" / "curriculum.jsonl").unlink()
     (data,) = page_data(write_report([tmp_path], tmp_path / "out", progress=False))

@@ -15,7 +15,7 @@ import pytest
 
 from proposer_rl.report import reading
 from proposer_rl.report.figures import draw_run
-from proposer_rl.report.reading import UnreadableRun, find_runs, read_run
+from proposer_rl.report.reading import UnreadableRun, begun, find_runs, read_run
 from proposer_rl.report.runs import share_map
 from research.claims import axis_means
 from research.publish import publish
@@ -76,6 +76,14 @@ def test_runs_are_found_at_any_depth_once_and_not_through_links(tmp_path: Path) 
     elsewhere = write_run(tmp_path.parent / f"{tmp_path.name}_elsewhere" / "run")
     os.symlink(elsewhere, tmp_path / "link")
     assert find_runs([tmp_path, two]) == sorted([one.resolve(), two.resolve()])
+
+
+def test_runs_of_a_sweep_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for number in (10, 2, 0, 11, 1):
+        write_run(tmp_path / f"{number}_plr", seeds=[number])
+    ordered = [f"{number}_plr" for number in (0, 1, 2, 10, 11)]
+    assert [path.name for path in find_runs([tmp_path])] == ordered
+    assert [path.name for path in begun(tmp_path)] == ordered
 
 
 @pytest.mark.parametrize("name", ["missing", "empty"])

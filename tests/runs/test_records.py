@@ -39,4 +39,5 @@ def test_numbers_are_finite_and_of_numbers_alone(value) -> None:
 def test_columns_are_told_in_words() -> None:
     assert words("id_greedy_success") == "ID greedy success"
     assert words("target_return") == "target return"
+    assert words("all_success") == "all success"
     assert level_text("id_success", 0.8) == "80%" and level_text("id_return", -2.5) == "-2.5"

@@ -318,7 +318,7 @@ def test_a_plain_loop_in_a_new_process_reaches_what_was_measured(train: Any) -> 
         task, agent, levels = run.task(), run.solver(), run.task().evaluated_on["all"]
         expected.append(task.performance(agent, levels, torch.Generator())["return"][-1].tolist())
         given = []
-        for play in plays(levels):
+        for play in plays(levels, task._parameters):
             values = {**play.values, "force_mag": play.values.get("force")}
             if name == "cartpole":
                 length = values["half length"]

@@ -195,7 +195,7 @@ def paying(reward: Any) -> gymnasium.Env[Any, Any]:
     ("env", "more", "message"),
     [
         (paying({"a": 1.0}), {}, "env: the reward must be a number, not {'a': 1.0}"),
-        (paying(np.nan), {}, "env: step pays a reward of nan: it must be finite"),
+        (paying(np.nan), {}, "return_=nan: must be finite"),
         (paying(1.0), {"success": "won"}, "success='won': .* it has, terminated, truncated, or"),
         (paying(1.0), {"success": lambda last: None}, "success=.*: gives None of the last info;"),
     ],

@@ -235,7 +235,7 @@ def draws(what: Any) -> Any:
 NINE = {"g": range(9)}
 LOW = {"low": 0, "high": 9}
 NO_PARAMETERS: list[tuple[Any, dict[str, Any], str]] = [
-    ({"g": ["a", "b", "a"]}, {}, "ranges.g=.*: must have each text once"),
+    ({"g": ["a", "b", "a"]}, {}, "ranges.g=.*: values=.*: must have each once"),
     ({"g": ["a", "b"]}, {"target": {"g": []}}, r"target.g=\[\]: must be among"),
     ({"g": (0.0, HUGE)}, {}, r"ranges.g=\(0.0, 1e\+39\): .* both finite, at"),
     ({"g": (2.0, 1.0)}, {}, r"ranges.g=\(2.0, 1.0\): low=2.0 must be below"),

@@ -9,7 +9,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from proposer_rl.settings import ArgumentError, settings, shown
-from proposer_rl.tasks.parameters import LARGEST
 
 ROUNDING = 1e-6  # of a sum of rewards, as a share of it: ten times 0.1 is 0.9999999999999999
 
@@ -21,19 +20,13 @@ class UnfitEnvironmentError(ValueError):
 
 
 def stepped(result: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-    """Returns what a step has returned, the reward as a finite float, the ends as truth values.
+    """Returns what a step has returned, the reward as a float, the ends as truth values.
 
     Raises:
-        UnfitEnvironmentError: if they are not.
+        UnfitEnvironmentError: if the reward is no number.
     """
     seen, reward, terminated, truncated, info = result
-    over = as_flag(terminated, "terminated"), as_flag(truncated, "truncated")
-    reward = as_number(reward, "the reward")
-    if not abs(reward) <= LARGEST:
-        raise UnfitEnvironmentError(
-            f"step pays a reward of {reward}: it must be finite, also as float32"
-        )
-    return seen, reward, *over, info
+    return seen, as_number(reward, "the reward"), bool(terminated), bool(truncated), info
 
 
 def as_number(value: Any, what: str) -> float:
@@ -59,8 +52,6 @@ def as_flag(value: Any, what: str) -> bool:
     Raises:
         UnfitEnvironmentError: if it is none.
     """
-    if type(value) is bool:
-        return value
     number = as_number(value, what)
     if number not in (0, 1):
         raise UnfitEnvironmentError(f"{what} must be true or false, not {shown(value)}")
@@ -116,10 +107,8 @@ class SuccessSettings:
 
     def __post_init__(self) -> None:
         needed = {"return": "least", "info": "key"}.get(self.kind)
-        for name in ("least", "key"):
-            if (getattr(self, name) is not None) != (name == needed):
-                verb = "missing" if name == needed else "has no effect"
-                raise ArgumentError(f"{name}: {verb} with kind={self.kind}")
+        if needed and getattr(self, needed) is None:
+            raise ArgumentError(f"{needed}: missing with kind={self.kind}")
 
     def __call__(self, step: Step) -> bool:
         """Returns whether an episode with this last step, or with ``once`` any such, is a success.

@@ -13,6 +13,8 @@ import gymnasium
 import numpy as np
 import torch
 
+from proposer_rl.tasks.ranges import is_real, value_text
+
 
 class AttributeRefusedError(ValueError):
     """An environment has no such thing, or does not take it; the message is one line."""
@@ -59,7 +61,7 @@ def write_attribute(environment: Any, path: str, value: Any) -> None:
     except Exception as error:  # a setter may raise anything
         reason = " ".join(str(error).split())
         raise AttributeRefusedError(
-            f"{path} of {type(environment).__name__} cannot be set to {_shown(value)}: "
+            f"{path} of {type(environment).__name__} cannot be set to {value_text(value)}: "
             f"{type(error).__name__}: {reason}"
         ) from error
     if shadows and last in vars(holder):
@@ -79,7 +81,7 @@ def mismatch(environment: Any, path: str, value: Any) -> str | None:
     """
     for layer, now in _readings(environment, path):
         try:
-            if isinstance(value, int | float):
+            if is_real(value):
                 # It may be kept in 32 bits.
                 same = math.isclose(float(now), float(value), rel_tol=1e-5, abs_tol=1e-8)
             else:
@@ -87,7 +89,7 @@ def mismatch(environment: Any, path: str, value: Any) -> str | None:
         except (TypeError, ValueError, RuntimeError):
             same = False
         if not same:
-            return f"{path} of {type(layer).__name__} is {now}, not {_shown(value)}"
+            return f"{path} of {type(layer).__name__} is {now}, not {value_text(value)}"
     return None
 
 
@@ -100,10 +102,6 @@ def _readings(environment: Any, path: str) -> Iterator[tuple[Any, Any]]:
                 yield environment, read_attribute(environment, path)
         environment = environment.env
     yield environment, read_attribute(environment, path)
-
-
-def _shown(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, int | float) else repr(value)
 
 
 def _in_place_of(before: Any, value: Any, path: str) -> Any:

@@ -80,7 +80,8 @@ class GymnasiumEnv(EnvBase):
         check_torch_defaults()
         super().__init__(device=levels.device or "cpu", batch_size=levels.batch_size)
         self._reward_scale = reward_scale
-        self._plays = plays(levels)
+        self._parameters = parameters
+        self._plays = plays(levels, parameters)
         registered = gymnasium.registry.get(make.env_id)
         players = [
             partial(_player, registered, make, parameters, play, success, once)
@@ -97,7 +98,7 @@ class GymnasiumEnv(EnvBase):
 
     def set_levels(self, levels: TensorDictBase) -> None:
         """Sets the levels [*B] that are played from the next reset on."""
-        self._plays = plays(levels)
+        self._plays = plays(levels, self._parameters)
         self._vector.set_attr("play", self._plays)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
@@ -165,13 +166,13 @@ class GymnasiumEnv(EnvBase):
         """Does nothing, as what is random belongs to the levels."""
 
 
-def plays(levels: TensorDictBase) -> list[GymLevel]:
-    """Returns what players are to play for levels [*B], in one row."""
-    columns = {str(name): entry.flatten().tolist() for name, entry in levels.items()}
-    seeds = columns.pop(SEED)
+def plays(levels: TensorDictBase, parameters: Mapping[str, ParameterSettings]) -> list[GymLevel]:
+    """Returns what players are to play for levels [*B] of some parameters, in one row."""
+    rows = levels.reshape(-1)
+    columns = [given.space_bins().named(rows[name]) for name, given in parameters.items()]
     return [
-        GymLevel(dict(zip(columns, row, strict=True)), seed)
-        for seed, *row in zip(seeds, *columns.values(), strict=True)
+        GymLevel(dict(zip(parameters, row, strict=True)), seed)
+        for seed, *row in zip(rows[SEED].tolist(), *columns, strict=True)
     ]
 
 

@@ -68,8 +68,7 @@ class Camera:
                 return self._drawn(play, actions)
             except Exception:  # as above, of another level
                 self.works = False
-        numbers = [f"{name} {value:.4g}" for name, value in play.values.items()]
-        return written(numbers or [f"{SEED} {play.seed}"])
+        return written(play.lines or [f"{SEED} {play.seed}"])
 
     def _drawn(self, play: GymLevel, actions: Tensor | None) -> NDArray[np.uint8]:
         self._player.play = play

@@ -24,8 +24,8 @@ from proposer_rl.tasks.gymnasium.answers import (
 )
 from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, mismatch, write_attribute
 from proposer_rl.tasks.gymnasium.spaces import Layout, typed
-from proposer_rl.tasks.parameters import SEED
-from proposer_rl.tasks.ranges import RangeSettings
+from proposer_rl.tasks.parameters import MOST_BINS, SEED
+from proposer_rl.tasks.ranges import RangeSettings, value_text
 
 # The dotted name of a function or class, or that with its further arguments by name.
 WrapperSettings = str | Annotated[dict[str, dict[str, Any]], Len(1, 1)]
@@ -33,34 +33,27 @@ WrapperSettings = str | Annotated[dict[str, dict[str, Any]], Len(1, 1)]
 
 @settings
 class ParameterSettings(RangeSettings):
-    """A number of the environment that differs between levels.
+    """A parameter of the environment that differs between levels: a number, a text or the like.
 
     Attributes:
+        values: rising numbers; or texts, truth values, lists, each of which is set as it is.
         set: how it gets into the environment, before each reset: as an attribute, as an argument
             of the constructor (the environment is then built anew where it changes), as an option
-            of the reset, or by a function that is called with the environment and the number.
+            of the reset, or by a function that is called with the environment and the value.
         name: of the attribute (dots lead to parts of the environment, numbers to elements),
             argument, option or function (which must be given), or of several that all get the
             value; None for the parameter's own name.
-        to: what each of ``values`` stands for, where that is no number: texts, lists, truth values.
     """
 
+    values: Annotated[list[Any], Len(1, MOST_BINS)] | None = None
+    target: Any
     set: Literal["attribute", "argument", "option", "call"] = "attribute"
     name: str | Annotated[list[str], Len(1)] | None = None
-    to: list[Any] | None = None
-
-    def __post_init__(self) -> None:
-        if self.to is not None and len(self.to) != len(self.values or []):
-            raise ValueError(f"to={self.to}: must be one for each of values={self.values}")
 
     def names(self, own: str) -> list[str]:
         """Returns the names that get the value of the parameter, whose own name is given."""
         name = own if self.name is None else self.name
         return [name] if isinstance(name, str) else name
-
-    def given(self, value: float) -> Any:
-        """Returns what the environment gets for a value, as nothing has changed it yet."""
-        return value if self.to is None else deepcopy(self.to[(self.values or []).index(value)])
 
 
 def wrapper_error(wrapper: WrapperSettings, error: Exception | str) -> UnfitEnvironmentError:
@@ -120,12 +113,17 @@ class MakeEnvironment:
 class GymLevel(NamedTuple):
     """A level: values of the parameters by name, and the seed of every reset."""
 
-    values: Mapping[str, float]
+    values: Mapping[str, Any]
     seed: int
+
+    @property
+    def lines(self) -> list[str]:
+        """Returns the parameters' values in lines, as they are shown."""
+        return [f"{name} {value_text(value, 4)}" for name, value in self.values.items()]
 
     def __str__(self) -> str:
         """Returns the level as a text."""
-        values = [f"{name}={value:g}" for name, value in self.values.items()]
+        values = [f"{name}={value_text(value)}" for name, value in self.values.items()]
         return ", ".join([*values, f"{SEED}={self.seed}"])
 
 
@@ -271,7 +269,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         return {name: self._value(parameter) for parameter, how, name in self._ways if how == way}
 
     def _value(self, parameter: str) -> Any:
-        return self.parameters[parameter].given(self._play.values[parameter])
+        return deepcopy(self._play.values[parameter])  # the environment may change a list
 
     def _refused(self, error: Exception) -> UnfitEnvironmentError:
         return UnfitEnvironmentError(

@@ -23,6 +23,7 @@ from torchrl.envs import EnvBase, Transform
 
 from proposer_rl.extras import install_command, where_to_look
 from proposer_rl.learning import SolverSettings, in_first_episode
+from proposer_rl.runs.records import png
 from proposer_rl.settings import settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
@@ -31,6 +32,7 @@ from proposer_rl.tasks.gymnasium.batched_env import FLAGS, GymnasiumEnv, Vectori
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork, solver_network
 from proposer_rl.tasks.gymnasium.pictures import FRAMES, NO_FRAMES, Camera
 from proposer_rl.tasks.gymnasium.player import (
+    GymLevel,
     LevelPlayer,
     MakeEnvironment,
     ParameterSettings,
@@ -61,7 +63,7 @@ class EvaluationSettings:
 
 
 class GymnasiumTask(Task):
-    """An environment of Gymnasium some of whose numbers make a level.
+    """An environment of Gymnasium some of whose settings make a level.
 
     Gymnasium's vector environments step it on the CPU; levels, states and Solvers are on the
     context's device.
@@ -146,7 +148,7 @@ class GymnasiumTask(Task):
         )
         self.title = env_id
         first = self.evaluated_on["target"][:1]
-        (self._first,) = plays(first)
+        (self._first,) = plays(first, parameters)
         with _named(env_id, extra):
             self.max_steps = tried(self._make, parameters, space.bins, self._first, success)
         self._seen, self._acts = self._specs(first)
@@ -157,11 +159,7 @@ class GymnasiumTask(Task):
         self._measured = {
             "environment": [env_id, arguments, list(wrappers), [repr(t) for t in transforms or []]],
             "steps": self.max_steps,
-            "parameters": {
-                # Runs from before there was `to` are comparable where there still is none.
-                name: {key: said for key, said in asdict(p).items() if key != "to" or said}
-                for name, p in parameters.items()
-            },
+            "parameters": {name: one.measured for name, one in parameters.items()},
             "success": asdict(success),
             "evaluation": asdict(evaluation),
             "train_seeds": train_seeds,
@@ -221,10 +219,10 @@ class GymnasiumTask(Task):
         self, levels: TensorDictBase, rollout: TensorDictBase | None
     ) -> list[dict[str, Any]]:
         """Returns pictures of levels [n] and first episodes there [n, T], and the parameters."""
-        records = super().record(levels, rollout)
+        shown = zip(self.pictures(levels, rollout), self._plays(levels), strict=True)
         return [
-            {**record, "level": {**play.values, SEED: play.seed}}
-            for record, play in zip(records, plays(levels), strict=True)
+            {"picture": png(p), "text": one.lines, "level": {**one.values, SEED: one.seed}}
+            for p, one in shown
         ]
 
     def pictures(
@@ -232,11 +230,13 @@ class GymnasiumTask(Task):
     ) -> list[NDArray[np.uint8]]:
         """Draws frames of levels [n], and of the Solver's first episode there [n, T]."""
         if rollout is None:
-            return [self._camera.picture(play, None) for play in plays(levels)]
+            return [self._camera.picture(play, None) for play in self._plays(levels)]
         first = in_first_episode(rollout)
         return [
             self._camera.picture(play, actions[steps])
-            for play, actions, steps in zip(plays(levels), rollout["action"], first, strict=True)
+            for play, actions, steps in zip(
+                self._plays(levels), rollout["action"], first, strict=True
+            )
         ]
 
     def own_spaces(self) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any]]:
@@ -250,13 +250,16 @@ class GymnasiumTask(Task):
                 "transforms: these are not applied to observations of a plain environment; put "
                 "run.solver().actor() into a TransformedEnv with them"
             )
-        env = LevelPlayer(self._make, self._parameters, plays(self.evaluated_on["target"][:1])[0])
+        env = LevelPlayer(self._make, self._parameters, self._first)
         env.close()
         return env.observation_space, env.action_space
 
     @cached_property
     def _camera(self) -> Camera:
         return Camera(self._make, self._parameters, self._first)
+
+    def _plays(self, levels: TensorDictBase) -> list[GymLevel]:
+        return plays(levels, self._parameters)
 
     def _unpaid(self) -> list[Transform]:
         return [one for one in self._transforms if "reward" not in one.out_keys]

@@ -23,6 +23,7 @@ from proposer_rl.tasks.gymnasium.player import (
 )
 from proposer_rl.tasks.gymnasium.spaces import PartTaken, assembled, leaves
 from proposer_rl.tasks.parameters import Bins
+from proposer_rl.tasks.ranges import Labelled, value_text
 
 SHORT = 64  # steps of an episode in which levels are compared
 RESETS = 3  # after which a level must still be there
@@ -39,8 +40,8 @@ def tried(
 ) -> int:
     """Plays an episode on a level of the target, and short ones at both ends of each parameter.
 
-    At the ends of a parameter's bins all others are as in the target. Where its values stand for
-    something else, each is tried. What Gymnasium's ``check_env`` finds is a warning.
+    At the ends of a parameter's bins all others are as in the target. Where its values are no
+    numbers, each is tried. What Gymnasium's ``check_env`` finds is a warning.
 
     Returns:
         Steps of an episode at most.
@@ -49,7 +50,6 @@ def tried(
         ValueError: in a line that names the key, for what cannot be made, set or read.
         ImportError, gymnasium.error.Error: of the environment, if it cannot be made.
     """
-    _check_places(parameters)
     _check_interface(LevelPlayer(make, parameters, target))
     _check_wrappers(make, parameters, target)
     player = LevelPlayer(make, parameters, target, success)
@@ -58,30 +58,16 @@ def tried(
         raise ValueError("max_steps: missing: the environment has no time limit of its own")
     _check_episode(player, success, limit)
     for name, part in bins.items():
-        some = part.ends if parameters[name].to is None else part.low.tolist()
+        ends = part.low if isinstance(part, Labelled) else torch.stack([part.low[0], part.high[-1]])
+        some = part.named(ends)
         plays = [target._replace(values={**target.values, name: one}) for one in some]
         _check_values(player, name, plays)
     player.close()
     return limit
 
 
-def _check_places(parameters: Mapping[str, ParameterSettings]) -> None:
-    """Refuses two parameters of which one would undo the other."""
-    taken: dict[tuple[str, str], str] = {}
-    for name, given in parameters.items():
-        for path in given.names(name):
-            other = taken.setdefault((given.set, path), name)
-            if other != name:
-                raise ValueError(f"parameters.{name}: {path} is set by parameters.{other}, too")
-
-
 def _check_interface(player: LevelPlayer) -> None:
     """Lets Gymnasium check the environment; what it cannot do with it is no reason to refuse it."""
-    for name, _ in leaves(player.observation_space):
-        if name.split(".")[-1] == "action_mask":
-            warnings.warn(
-                f"{name}: is shown to the Solver as numbers; actions are not masked", stacklevel=2
-            )
     player.reset()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ADVICE)
@@ -152,14 +138,14 @@ def _check_values(player: LevelPlayer, name: str, plays: list[GymLevel]) -> None
         if now != shown:
             raise ValueError(
                 f"parameters.{name}: all levels must show and take the same, but "
-                f"{play.values[name]:g} changes {shown} to {now}"
+                f"{value_text(play.values[name])} changes {shown} to {now}"
             )
     ends = plays[0], plays[-1]
-    first, last = (play.values[name] for play in ends)
+    first, last = (value_text(play.values[name]) for play in ends)
     same = first != last and _same_episodes(episodes[0], episodes[-1])
     if same and _look_alike(player, ends):
         warnings.warn(
-            f"parameters.{name}: {len(episodes[0])} steps with {first:g} and with {last:g} are the "
+            f"parameters.{name}: {len(episodes[0])} steps with {first} and with {last} are the "
             "same to the last digit: the environment may not read this parameter",
             stacklevel=2,
         )

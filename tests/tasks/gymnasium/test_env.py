@@ -225,7 +225,6 @@ def test_a_return_is_reached_up_to_rounding(reward: Any) -> None:
     [
         ({"kind": "return"}, "least: missing"),
         ({"kind": "info"}, "key: missing"),
-        ({"kind": "survived", "least": 1.0}, "least: has no effect"),
     ],
 )
 def test_success_has_what_its_kind_needs(settings: Any, message: str) -> None:

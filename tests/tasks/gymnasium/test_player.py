@@ -8,8 +8,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 
 from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
+from proposer_rl.tasks.gymnasium.batched_env import plays
 from proposer_rl.tasks.gymnasium.player import (
     GymLevel,
     LevelPlayer,
@@ -17,7 +19,8 @@ from proposer_rl.tasks.gymnasium.player import (
     ParameterSettings,
     imported,
 )
-from tests.tasks.gymnasium.toys import LIMIT, NO_BOX2D, PARAMETERS, WALK
+from proposer_rl.tasks.ranges import spaces
+from tests.tasks.gymnasium.toys import LIMIT, NO_BOX2D, PARAMETERS, WALK, Walk
 
 LEVEL = {"speed": 1.25, "width": 2.0, "begin": 1, "wind": -1}
 CARTPOLE = {
@@ -51,29 +54,41 @@ def test_each_number_gets_where_it_belongs() -> None:
     assert again is not inner and (again.width, again.engine.speed) == (1.0, 1.25)
 
 
+def keeping(self: Walk, *, seed: Any = None, options: Any = None) -> Any:
+    """Resets, whatever the options are."""
+    self.kept.append((seed, options))
+    return np.zeros(2), {}
+
+
 CELLS, MAPS = [[1, 1], [3, 4]], [["SF", "FG"], ["SH", "FG"]]
 
 
 @pytest.mark.parametrize(
-    ("env_id", "way", "name", "to", "found"),
+    ("env_id", "way", "name", "values", "found"),
     [
-        (WALK, "option", "start", [0.5, 2.5], lambda env: env.kept[-1][1]["start"]),
+        (WALK, "option", "start", ["left", "right"], lambda env: env.kept[-1][1]["start"]),
         (WALK, "option", "cell", CELLS, lambda env: env.kept[-1][1]["cell"]),
         (WALK, "attribute", "engine.memory", [False, True], lambda env: env.engine.memory),
         (WALK, "attribute", "kept", CELLS, lambda env: env.kept[:2]),
         ("FrozenLake-v1", "argument", "desc", MAPS, lambda env: env.desc.astype(str).tolist()),
     ],
 )
-def test_a_value_may_stand_for_anything(
-    env_id: str, way: Any, name: str, to: list[Any], found: Any
+def test_a_value_may_be_anything(
+    env_id: str, way: Any, name: str, values: list[Any], found: Any, monkeypatch: Any
 ) -> None:
-    given = ParameterSettings(set=way, name=name, values=[1, 5], to=to, target=5)
-    player = LevelPlayer(MakeEnvironment(env_id), {"a": given}, GymLevel({"a": 5}, 7))
-    for value, thing in ((5, to[1]), (5, to[1]), (1, to[0])):
-        player.play = GymLevel({"a": value}, 7)
+    monkeypatch.setattr(Walk, "reset", keeping)
+    given = ParameterSettings(set=way, name=name, values=values, target=values[1])
+    parameters = {"a": given}
+    space, target = spaces(parameters)
+    assert target.sample(3, torch.Generator())["a"].tolist() == [1, 1, 1]
+    levels = space.generate(torch.tensor([[1, 1, 0]]), [torch.Generator()])
+    played = plays(levels, parameters)
+    player = LevelPlayer(MakeEnvironment(env_id), parameters, played[0])
+    for play, value in zip(played, (values[1], values[1], values[0]), strict=True):
+        player.play = play
         player.reset()
         now = found(player.unwrapped)
-        assert now == (thing if name != "desc" else [[*row] for row in thing])
+        assert now == (value if name != "desc" else [[*row] for row in value])
         if isinstance(now, list):
             now.append("spoilt")
 

@@ -63,8 +63,6 @@ WRONG: list[tuple[dict[str, Any], str]] = [
      r"action space Box.*int64\): there is a policy for .* a Box of floats"),
     ({"env_id": "tests.tasks.gymnasium.broken:Walk-v0", "parameters": {}},
      r"env_id=.*: it cannot be made: ZeroDiv.* \(broken.py, line \d+\)$"),
-    ({"parameters": {n: ParameterSettings(name="wind", values=[1], target=1) for n in "ab"}},
-     "parameters.b: wind is set by parameters.a, too"),
     ({"parameters": {"a,b": PARAMETERS["width"]}}, "parameters.a,b: must be a name of letters"),
     ({"wrappers": ["nowhere.Wrapper"]}, "wrappers: nowhere.Wrapper: .*cannot be imported"),
     ({"arguments": {"foo": 1}}, "parameters: .*refuses .*unexpected keyword"),
@@ -316,19 +314,57 @@ def test_many_parameters_and_values_are_described_in_short() -> None:
     assert told.about["Target"].endswith("...") and len(told.about["Target"]) <= 400
 
 
-def test_what_values_stand_for_is_tried_and_distinguishes_measurements() -> None:
-    def parameters(values: list[int], to: Any) -> dict[str, ParameterSettings]:
-        return {"width": ParameterSettings(set="argument", values=values, to=to, target=1)}
+class Crates(Line):
+    """Says of what it is, in what it shows; a step costs nothing."""
 
-    with pytest.raises(ValueError, match=r"to=\[2.0\]: must be one for each of values=\[1, 2\]"):
-        parameters([1, 2], [2.0])
-    with pytest.raises(ValueError, match=r"refuses width=2, seed=\d+: ValueError: width must"):
-        walk_task(parameters=parameters([1, 2, 3], [2.0, -1.0, 1.0]))
-    some, others, none = (
-        walk_task(parameters=parameters([1, 2], to)) for to in ([2.0, 3.0], [3.0, 2.0], None)
-    )
-    assert some.facts["measured"] != others.facts["measured"]
-    assert "to" not in none.facts["measured"]["parameters"]["width"]  # as in runs from before
+    def __init__(self, material: str = "wood", wet: Any = False, render_mode: Any = None) -> None:
+        if material not in ("wood", "steel", "glass") or type(wet) is not bool:
+            raise ValueError(f"no crate of {material!r}, {wet!r}")
+        super().__init__(render_mode)
+        self.place = float(["wood", "steel", "glass"].index(material) + 3 * wet)
+
+    def seen(self) -> Any:
+        return np.array([self.x, self.place], np.float32)
+
+
+gymnasium.register("Crates-v0", Crates, max_episode_steps=5)
+
+
+def crates(*materials: str) -> dict[str, ParameterSettings]:
+    given = {"material": {"values": [*materials], "target": materials[-1]}}
+    given["wet"] = {"values": [True, False], "target": True}
+    return {name: ParameterSettings(set="argument", **own) for name, own in given.items()}
+
+
+def test_texts_and_truth_values_are_set_tried_and_shown_as_they_are() -> None:
+    env_id, many = f"{HERE}:Crates-v0", crates("wood", "steel", "glass")
+    task = walk_task(env_id=env_id, parameters=many)
+    levels = task.space.generate(torch.tensor([[0, 5, 4, 4]]), [Streams(0).generator()])
+    shown = task.environment(levels).reset()["observation"][0, :, 1]
+    assert shown.tolist() == [3.0, 2.0, 5.0, 5.0]
+    records = task.record(levels[0], None)
+    assert [one["text"] for one in records[:2]] == [
+        ["material wood", "wet True"], ["material glass", "wet False"],
+    ]  # fmt: skip
+    told = json.loads(json.dumps(records[1]["level"]))
+    assert (told["material"], told["wet"]) == ("glass", False)
+    facts = checked(TaskFacts, task.facts, "task")
+    assert facts.space == {"material": ["wood", "steel", "glass"], "wet": ["True", "False"]}
+    assert facts.about["Target"] == "material glass; wet True"
+    learner = task.learner([Streams(0)])
+    learner.env.set_levels(levels)
+    columns = task.training_metrics(levels, learner.collect([Streams(2).generator()]))
+    shares = {name: float(columns[name]) for name in columns.keys() if "=" in name}
+    assert shares == {
+        "material=wood": 0.25, "material=steel": 0, "material=glass": 0.75,
+        "wet=True": 0.75, "wet=False": 0.25,
+    }  # fmt: skip
+    # A belief sees which of them it is, so that none lies between two others.
+    assert task.space.inputs(levels[0, :2]).tolist() == [[1, 0, 0, 1, 0], [0, 0, 1, 0, 1]]
+    with pytest.raises(ValueError, match=r"refuses material=clay, wet=True, seed=\d+: ValueError"):
+        walk_task(env_id=env_id, parameters=crates("wood", "clay", "glass"))
+    others = walk_task(env_id=env_id, parameters=crates("steel", "wood", "glass"))
+    assert others.facts["measured"] != task.facts["measured"]
 
 
 @pytest.mark.parametrize(

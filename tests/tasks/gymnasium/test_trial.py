@@ -79,11 +79,8 @@ MISREAD: list[tuple[dict[str, Any], str]] = [
     ({"step": lambda self, a: (*Line.step(self, a)[:3], {})}, "env_id=Odd.*step raises ValueError"),
     (steps(None), "the reward must be a number, not None"),
     (steps(np.zeros(2)), "the reward must be a number, not array"),
-    (steps(np.nan), "a reward of nan: it must be finite"),
-    (steps(1e300), "a reward of 1e.300: it must be finite, also as float32"),
     ({"step": lambda self, a: 1 / 0}, r"env_id=Odd.*step raises ZeroDivisionError: .*"
      r"\(test_trial.py, line \d+\), on the level goal=3, seed=\d+"),
-    (steps(0.0, 2), "terminated must be true or false, not 2"),
     (shows({"b": 1}, spaces.Dict({"a": spaces.Discrete(3)})), "refuses goal=3, .*KeyError: 'a'"),
     (shows({"a": "abc"}, spaces.Dict({"a": spaces.Text(3)})),
      "no network for Text.*its part a; .*FilterObservation"),
@@ -247,8 +244,6 @@ def hill(colour: int) -> dict[str, Any]:
 
 
 HILL = {"hill": ParameterSettings(values=[1.0, 3.0], target=3.0)}
-MASKED = spaces.Dict({"x": spaces.Box(0, 1, (1,)), "action_mask": spaces.MultiBinary(2)})
-MASK = {"x": np.zeros(1, np.float32), "action_mask": np.ones(2, np.int8)}
 NOISE = {"seen": lambda self: np.array([np.random.normal(), self.goal], np.float32)}
 IGNORED = {"typo": ParameterSettings(set="option", values=[0, 1], target=0)}
 DOUBTED: list[tuple[Any, Any, str | None]] = [
@@ -256,7 +251,6 @@ DOUBTED: list[tuple[Any, Any, str | None]] = [
     ({}, GOAL, None),
     (hill(0), HILL, "parameters.hill: .* may not read this parameter"),
     (hill(50), HILL, None),
-    (shows(MASK, MASKED), GOAL, "action_mask: .* actions are not masked"),
     (NOISE, GOAL, "check_env: .* is non-deterministic"),
     ({"reset": lambda self, seed=None, options=None: Line.reset(self)}, GOAL, "check_env: "),
 ]  # fmt: skip
@@ -366,11 +360,16 @@ def test_what_fails_after_the_trial_names_the_level(vectorization: Any) -> None:
         seen, *rest = Line.step(self, action)
         if self.total > 3 * LIMIT and self.goal == 1.0:
             raise RuntimeError("it has\nexploded")
-        return (seen * (np.nan if self.total > 3 * LIMIT else 1), *rest)
+        if self.total > 3 * LIMIT and self.goal == 2.0:
+            rest[0] = 1e300  # beyond float32
+        elif self.total > 3 * LIMIT:
+            seen = seen * np.nan
+        return seen, *rest
 
     task = line_task(odd(step=step), vectorization=vectorization)
     for goal, said in (
         (1.0, "step raises RuntimeError: it has exploded"),
+        (2.0, "reward: NaN or infinity, or a number beyond float32"),
         (3.0, "observation: Na"),
     ):
         level = TensorDict({"goal": torch.tensor([[goal]]), "seed": torch.tensor([[7]])}, [1, 1])
