@@ -29,7 +29,6 @@ FRAMES = "with the curriculum's (M)"
 # Pages with tables, updates of the runs in them, folder of their results, headline, least number of
 # rows. A page has no two tables of runs of the same length.
 TABLES = [
-    ("README.md", 400, "medium", "ID success", 5),
     ("docs/explanation/results.md", 240, "sampled", "ID success", 5),
 ]
 
@@ -120,7 +119,7 @@ def test_the_published_proposer_can_be_used(
 
 # Pages, or sections of them, whose intervals are all of studies in the repository; and how many.
 PROSE = {
-    "README.md": 13,
+    "README.md": 5,
     "docs/explanation/filtering.md": 5,
     "docs/explanation/first_order.md#Results": 4,
     "docs/explanation/proposer.md#Results": 3,

@@ -18,7 +18,7 @@ from proposer_rl.report.statistics import FEWEST, HELD
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing, render
 from proposer_rl.report.tables import Table
-from proposer_rl.runs.folder import is_rate, write_atomically
+from proposer_rl.runs.folder import can_reach, is_rate, write_atomically
 from proposer_rl.runs.records import encoded, words
 
 PAGE = "report.html"
@@ -67,6 +67,9 @@ def read_checked(
         for label in given:
             if label not in labels:
                 raise OutputError(f"--{option}={label}: must be one of {'; '.join(labels)}")
+    for study in studies:
+        if threshold is not None and not can_reach(study.headline, threshold):
+            raise OutputError(f"--threshold={threshold:g}: must be above 0 and at most 1")
     return studies, notes
 
 

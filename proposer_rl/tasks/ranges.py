@@ -96,8 +96,9 @@ class RangeSettings(LineSettings):
     @property
     def measured(self) -> dict[str, Any]:
         """Returns what must be equal for measurements to be comparable."""
-        # Runs from before there was `log` are comparable where it is not used.
-        return {key: value for key, value in asdict(self).items() if key != "log" or value}
+        # Runs from before there were these are comparable where they are not used.
+        new = ("log", "to")
+        return {key: value for key, value in asdict(self).items() if key not in new or value}
 
 
 @dataclass(frozen=True)

@@ -295,7 +295,7 @@ def test_a_runner_of_rsl_rl_learns_and_keeps_the_teacher(runners: Any, tmp_path:
     one = learner(Runner, Fleet(512), tmp_path)
     one.learn(60, init_at_random_ep_len=True)
     log = one.env.term.teacher.log()
-    assert log["mean_success"] > 0.3 and log["mean_row"][0] > 4.5
+    assert log["mean_success"] > 0.3 and log["mean_row"] > 4.5
     assert log["dropped"] > 480  # the first of each, but for those that began with length 0
     saved = str(tmp_path / "model_59.pt")
     other = learner(Runner, Fleet(512))

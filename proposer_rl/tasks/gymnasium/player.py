@@ -43,17 +43,28 @@ class ParameterSettings(RangeSettings):
         name: of the attribute (dots lead to parts of the environment, numbers to elements),
             argument, option or function (which must be given), or of several that all get the
             value; None for the parameter's own name.
+        to: what the environment gets for each of ``values``, which are then numbers that say how
+            they are ordered and how far apart they are.
     """
 
     values: Annotated[list[Any], Len(1, MOST_BINS)] | None = None
     target: Any
     set: Literal["attribute", "argument", "option", "call"] = "attribute"
     name: str | Annotated[list[str], Len(1)] | None = None
+    to: list[Any] | None = None
+
+    def __post_init__(self) -> None:
+        if self.to is not None and len(self.to) != len(self.values or []):
+            raise ValueError(f"to={self.to}: must be one for each of values={self.values}")
 
     def names(self, own: str) -> list[str]:
         """Returns the names that get the value of the parameter, whose own name is given."""
         name = own if self.name is None else self.name
         return [name] if isinstance(name, str) else name
+
+    def given(self, value: Any) -> Any:
+        """Returns what the environment gets for a value, a copy that it may change."""
+        return deepcopy(value if self.to is None else self.to[(self.values or []).index(value)])
 
 
 def wrapper_error(wrapper: WrapperSettings, error: Exception | str) -> UnfitEnvironmentError:
@@ -269,7 +280,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         return {name: self._value(parameter) for parameter, how, name in self._ways if how == way}
 
     def _value(self, parameter: str) -> Any:
-        return deepcopy(self._play.values[parameter])  # the environment may change a list
+        return self.parameters[parameter].given(self._play.values[parameter])
 
     def _refused(self, error: Exception) -> UnfitEnvironmentError:
         return UnfitEnvironmentError(

@@ -40,8 +40,8 @@ def tried(
 ) -> int:
     """Plays an episode on a level of the target, and short ones at both ends of each parameter.
 
-    At the ends of a parameter's bins all others are as in the target. Where its values are no
-    numbers, each is tried. What Gymnasium's ``check_env`` finds is a warning.
+    At the ends of a parameter's bins all others are as in the target. Where it gets texts or
+    the like, each is tried. What Gymnasium's ``check_env`` finds is a warning.
 
     Returns:
         Steps of an episode at most.
@@ -58,7 +58,8 @@ def tried(
         raise ValueError("max_steps: missing: the environment has no time limit of its own")
     _check_episode(player, success, limit)
     for name, part in bins.items():
-        ends = part.low if isinstance(part, Labelled) else torch.stack([part.low[0], part.high[-1]])
+        each = isinstance(part, Labelled) or parameters[name].to is not None
+        ends = part.low if each else torch.stack([part.low[0], part.high[-1]])
         some = part.named(ends)
         plays = [target._replace(values={**target.values, name: one}) for one in some]
         _check_values(player, name, plays)

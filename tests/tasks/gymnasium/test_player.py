@@ -73,14 +73,23 @@ CELLS, MAPS = [[1, 1], [3, 4]], [["SF", "FG"], ["SH", "FG"]]
         ("FrozenLake-v1", "argument", "desc", MAPS, lambda env: env.desc.astype(str).tolist()),
     ],
 )
+@pytest.mark.parametrize("numbered", [False, True])
 def test_a_value_may_be_anything(
-    env_id: str, way: Any, name: str, values: list[Any], found: Any, monkeypatch: Any
+    numbered: bool,
+    env_id: str,
+    way: Any,
+    name: str,
+    values: list[Any],
+    found: Any,
+    monkeypatch: Any,
 ) -> None:
+    """As it stands, or for a number that says where it is in an order."""
     monkeypatch.setattr(Walk, "reset", keeping)
-    given = ParameterSettings(set=way, name=name, values=values, target=values[1])
-    parameters = {"a": given}
+    said: Any = {"values": [1, 5], "to": values, "target": 5}
+    said = said if numbered else {"values": values, "target": values[1]}
+    parameters = {"a": ParameterSettings(set=way, name=name, **said)}
     space, target = spaces(parameters)
-    assert target.sample(3, torch.Generator())["a"].tolist() == [1, 1, 1]
+    assert target.sample(3, torch.Generator())["a"].tolist() == [5 if numbered else 1] * 3
     levels = space.generate(torch.tensor([[1, 1, 0]]), [torch.Generator()])
     played = plays(levels, parameters)
     player = LevelPlayer(MakeEnvironment(env_id), parameters, played[0])
