@@ -48,6 +48,8 @@ nitpicky = True
 nitpick_ignore = [  # stand-ins, see below
     ("py:class", "transformers.TrainerCallback"),
     ("py:class", "TensorDictBase"),  # of tensordict, in a text alone
+    ("py:class", "DictConfig"),  # of OmegaConf, which is imported for type checks alone
+    ("py:exc", "HydraException"),
 ]
 
 myst_enable_extensions = ["dollarmath"]

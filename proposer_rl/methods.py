@@ -1,4 +1,4 @@
-"""Makes a curriculum from its configuration and the parts of a run: see :func:`build`.
+"""Makes a curriculum from its configuration and the parts of a run, by ``build``.
 
 The other functions here are named in configurations, too: they make the curricula that are no
 class of their own, and those with a Proposer.

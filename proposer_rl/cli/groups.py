@@ -80,7 +80,7 @@ def arranged(overrides: Sequence[str]) -> list[str]:
 
     Raises:
         ConfigError: if a group is set to what cannot be a file's name, such as ``task=null``.
-        OverrideParseException: if one is not in Hydra's grammar.
+        HydraException: if one is not in Hydra's grammar.
     """
     words = [_at_home(word) for word in overrides]
     return _ordered(map(_spelled, OverridesParser.create().parse_overrides(words)))
