@@ -206,13 +206,20 @@ class Experiment:
                 self._restore(before)
 
     def _log_cycle(self, improved: Sequence[Mapping[str, Any]] | None = None) -> bool:
-        """Writes the logs of the cycle that has ended, and metrics of its improvement."""
+        """Writes the logs of the cycle that has ended, and metrics of its improvement.
+
+        Each has the histogram of the levels trained on, unless the curriculum logs its own.
+
+        Returns:
+            Whether a curriculum logged something or was improved.
+        """
         logs = [curriculum.log() for curriculum in self.sides.curricula]
         metrics = [
             {**log, **own} for log, own in zip(logs, improved or [{}] * len(logs), strict=True)
         ]
-        if any(metrics):
-            self._tables.add_cycle(self.updates, self.cycles, metrics, self.costs)
+        rows = self.sides.with_histograms(metrics)
+        if any(rows):
+            self._tables.add_cycle(self.updates, self.cycles, rows, self.costs)
         return any(metrics)
 
     def _update(self) -> None:
