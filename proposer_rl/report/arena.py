@@ -137,11 +137,12 @@ class Arena:
         groups = [(study, study.group(one), study.group(other)) for study in self.tasks.values()]
         return sum(threshold_reached(study, a)[0] for study, a, b in groups if a and b)
 
-    def _factors(self, one: str, other: str) -> list[float]:
+    def _factors(self, one: str, other: str) -> tuple[float, float]:
         """Returns geometric means over tasks of the factors of frames and seconds."""
         groups = ([study.group(each) for each in (one, other)] for study in self.tasks.values())
         found = [factors(a, b) for a, b in groups if a and b]
-        return np.exp(np.log(found).mean(0)).tolist()
+        frames, seconds = np.exp(np.log(found).mean(0)).tolist()
+        return frames, seconds
 
 
 def arena(studies: Sequence[Study], baselines: Sequence[str] = ()) -> Arena | None:

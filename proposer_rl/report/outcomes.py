@@ -138,13 +138,13 @@ def first_rows(study: Study) -> list[Row]:
     return sorted(rows, key=lambda row: -row.difference.estimate)
 
 
-def factors(group: Group, baseline: Group) -> list[float]:
+def factors(group: Group, baseline: Group) -> tuple[float, float]:
     """Returns how many times the frames and the seconds of the baseline a method took."""
     found = []
     for spent in (lambda run: run.total_frames[-1], lambda run: run.own_seconds[-1]):
         own, other = (np.mean([*map(spent, each.runs)]) for each in (group, baseline))
         found.append(float(own / other) if other > 0 else math.nan)
-    return found
+    return found[0], found[1]
 
 
 def signed(difference: Interval) -> str:

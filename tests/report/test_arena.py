@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from proposer_rl.cli.report import main
+from proposer_rl.report import publish
 from proposer_rl.report.arena import Arena, answer, arena, differences, summary, task_table
 from proposer_rl.report.studies import read_studies
-from research import publish
 from tests.report.folders import TASK, write_rockets, write_run
 
 SPREAD = np.array([-0.1, -0.05, 0.0, 0.05, 0.1])
