@@ -6,7 +6,6 @@ import functools
 import io
 import json
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,7 +47,7 @@ REMEMBER = [name for name in EVERY if name not in SCORES]
 
 
 class Past(NamedTuple):
-    """A life of some updates: the state after it, and who goes on from there."""
+    """What some updates have led to: the state then, and who goes on from there."""
 
     state: bytes
     snapshot: TensorDict
@@ -134,49 +133,10 @@ def same(one: Any, other: Any) -> bool:
     return bool(one == other)
 
 
-Return = tuple[int, slice]  # number of an outstanding batch, and the part of it that comes back
-IN_ORDER = [(0, slice(None)), (1, slice(None))]
-OTHERWISE = [(1, slice(None)), (0, slice(1, None, 2)), (0, slice(0, None, 2))]
-
-
-OUTCOMES: dict[str, list[TensorDict]] = {}
-
-
 @functools.cache
 def shared() -> PPO:
     """A Solver for tests that train nobody."""
     return solvers([5])
-
-
-@functools.cache
-def in_order(name: str) -> tuple[Any, Any, Any]:
-    return two_outstanding(name, IN_ORDER)
-
-
-def two_outstanding(name: str, returns: Sequence[Return]) -> tuple[Any, Any, Any]:
-    """Of two batches that come back somehow: what is logged, proposed next, and the state then."""
-    curriculum, learner = resumed(name, shared())
-    student = TaskStudent(TASK, learner)
-    batches = [proposed(curriculum, student, n, Streams(0, "two", n)) for n in (P, P + 1)]
-    if name not in OUTCOMES:  # of the same batches whatever comes back of them, and when
-        OUTCOMES[name] = [played(student, batch, n) for n, batch in enumerate(batches)]
-    outcomes = OUTCOMES[name]
-    ledger = Ledger({"number": float, "place": float})
-    blocks = [ledger.add(batch) for batch in batches]
-    for block in blocks:
-        for id in range(block.start, block.end):
-            ledger.hand_out(id)
-    for number, part in returns:
-        places = np.arange(len(batches[number]))[part]
-        told = {"number": np.full(len(places), number), "place": places}
-        ledger.tell(ledger.find(blocks[number].start + places), told)
-    for batch, told in ledger.take():
-        outcome = outcomes[int(told["number"][0])][torch.from_numpy(told["place"]).long()]
-        curriculum.observe(student, batch, outcome)
-    logged = curriculum.log()
-    following = proposed(curriculum, student, P, Streams(0, "next"))
-    logged.pop("levels", None)
-    return logged, following, curriculum.state_dict()
 
 
 def played(student: TaskStudent, batch: Batch, number: int) -> TensorDict:
@@ -188,28 +148,21 @@ def played(student: TaskStudent, batch: Batch, number: int) -> TensorDict:
     return outcome_of(torch.cat(rollouts))
 
 
-@pytest.mark.parametrize("name", REMEMBER)
-def test_the_order_in_which_parts_come_back_has_no_effect(name: str) -> None:
-    """Two outstanding batches of different sizes, the second first and the first in two parts."""
-    logged, batch, state = in_order(name)
-    other_logged, other_batch, other_state = two_outstanding(name, OTHERWISE)
-    assert same(json.loads(json.dumps(logged)), json.loads(json.dumps(other_logged)))
-    assert (batch.levels == other_batch.levels).all()
-    assert (batch.notes == other_batch.notes).all()
-    assert same(state, other_state)
-
-
-LEARNING = ["plr", "accel", "progress of episodes", "alp_gmm", "paired"]
-LEARNING += ["adr", "terrain_levels", "spdl", "adaptive_mixture"]
-
-
-@pytest.mark.parametrize(
-    "name", [*LEARNING, "transport on a model", "filtered bins", "schedule", "mixed"]
-)
-def test_what_comes_back_makes_a_difference(name: str) -> None:
-    """Otherwise the test above would show nothing."""
-    missing = [(1, slice(None)), (0, slice(0, 1))]
-    assert not same(in_order(name)[2], two_outstanding(name, missing)[2])
+def test_results_in_any_order_and_parts_are_observed_in_order() -> None:
+    """Of one batch once, whatever came of it; what does not come back keeps nobody waiting."""
+    ledger, levels = Ledger({"return": float}), torch.arange(9.0)
+    for some in levels.split(4):
+        block = ledger.add(Batch(some))
+        for id in range(block.start, block.end):
+            assert ledger.hand_out(id) == id
+    observed = []
+    for ids in ([8, 5, 2], [6, 0], [3, 1]), ([7],):
+        for some in map(np.array, ids):
+            ledger.tell(ledger.find(some), {"return": some / 2})
+        for batch, told in ledger.take():
+            assert (told["return"] == batch.levels.numpy() / 2).all()
+            observed.append(batch.levels.tolist())
+    assert observed == [[0, 1, 2, 3], [5, 6], [8], [7]] and ledger.out == 1
 
 
 @every
