@@ -23,11 +23,9 @@ from proposer_rl.curricula import (
     TaskStudent,
 )
 from proposer_rl.curricula.contract import outcome_of_episodes
-from proposer_rl.experiment import Experiment, ScheduleSettings
 from proposer_rl.experiment.continued import ContinuedLevels
 from proposer_rl.experiment.side_by_side import SideBySide
 from proposer_rl.learning import PPOSettings, RolloutCollector, SolverSettings
-from proposer_rl.runs.folder import RunFolder
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.answers import SuccessSettings
@@ -35,6 +33,7 @@ from proposer_rl.tasks.gymnasium.batched_env import plays
 from proposer_rl.tasks.gymnasium.player import LevelPlayer
 from tests.same_run import assert_same_run
 from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, walk_task
+from tests.test_experiment import experiment
 from tests.tiny import tiny_task, tiny_view_task
 
 K, P, T = 2, 3, 4
@@ -210,34 +209,19 @@ def remembering() -> Any:
     return tiny_view_task(solver=SolverSettings(batch_size=P, ppo=ppo))
 
 
-def experiment(folder: Path, updates: int, task: Any) -> Experiment:
-    learner = task.learner([Streams(seed, "solver") for seed in SEEDS])
+def run(folder: Path, updates: int, task: Any) -> None:
     rule = ReplayRule(prioritization="rank", temperature=0.3, best=None, staleness=0.1)
     scorer = Scorer("positive_value_loss", "episodes")
     curricula = [ReplayCurriculum(task.space, scorer, rule, capacity=8) for _ in SEEDS]
-    return Experiment(
-        task,
-        learner,
-        curricula,
-        schedule=ScheduleSettings(
-            updates=updates,
-            cycle_length=5,
-            evaluate_every=5,
-            checkpoint_every=3,
-            checkpoint_seconds=None,
-            headline=task.metrics[0],
-        ),
-        seeds=SEEDS,
-        folder=RunFolder(folder),
-        progress=False,
-    )
+    lengths = {"updates": updates, "cycle_length": 5, "evaluate_every": 5, "threshold": 0.8}
+    experiment(folder, *SEEDS, curriculum=curricula, task=task, **lengths).run()
 
 
 @pytest.mark.parametrize("task", [walking, pytest.param(remembering, marks=pytest.mark.slow)])
 def test_a_resumed_run_goes_on_in_the_middle_of_its_episodes(task: Any, tmp_path: Path) -> None:
     for updates in (5, 9):
-        experiment(tmp_path / "resumed", updates, task()).run()
-    experiment(tmp_path / "whole", 9, task()).run()
+        run(tmp_path / "resumed", updates, task())
+    run(tmp_path / "whole", 9, task())
     assert_same_run(tmp_path / "resumed", tmp_path / "whole")
 
 

@@ -198,21 +198,26 @@ def test_a_state_of_another_class_is_refused_in_one_line(make: Make) -> None:
         make().load_state_dict({"nothing at all": 0})
 
 
-def test_the_number_of_levels_that_was_asked_for_is_proposed() -> None:
-    class Fewer(Curriculum):
-        def propose(self, student: Student, count: int, rng: Streams) -> Any:
-            return torch.zeros(count - 1)
-
-    with pytest.raises(ValueError, match=r"^curriculum=Fewer: proposes 3 levels where 4"):
-        proposed(Fewer(), Student(), 4, Streams(0))
+class Fewer(Curriculum):
+    def propose(self, student: Student, count: int, rng: Streams) -> Any:
+        return torch.zeros(count - 1)
 
 
-def test_a_batch_has_a_note_for_each_level() -> None:
-    with pytest.raises(
-        ValueError, match=r"^notes: have shape \[4\], but must have one for each of 3"
-    ):
-        Batch(torch.zeros(3, 7), TensorDict({}, [4]))
-    assert Batch(torch.zeros(3, 7)).notes.batch_size == (3,)
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: proposed(Fewer(), Student(), 4, Streams(0)), "curriculum=Fewer: proposes 3 .* 4"),
+        (
+            lambda: Batch(torch.zeros(3), TensorDict({}, [4])),
+            r"notes: have shape \[4\], .* of 3",
+        ),
+        (lambda: Curriculum().propose(Student(), 1, Streams(0)), "Curriculum must define propose"),
+        (lambda: Student(sing=print), "sing: unknown; there are: play"),
+    ],
+)
+def test_what_breaks_the_contract_is_refused(call: Any, message: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=f"^{message}"):
+        call()
 
 
 def test_whoever_observes_and_saves_nothing_is_told_so_once() -> None:
@@ -243,11 +248,6 @@ def test_no_module_hides_a_method() -> None:
     assert not modules & {path.stem for path in CONFIG_FOLDER.glob("method/*.yaml")}
 
 
-def test_a_curriculum_must_propose() -> None:
-    with pytest.raises(TypeError, match="Curriculum must define propose"):
-        Curriculum().propose(Student(), 1, Streams(0))
-
-
 def test_a_student_that_lacks_something_is_named() -> None:
     cars, windows = mountain_cars(), tiny_view_task()
     for task, need, reason in (
@@ -262,5 +262,3 @@ def test_a_student_that_lacks_something_is_named() -> None:
     for name in ABILITIES:
         with pytest.raises(UnfitStudentError, match=rf"{name}: it has no {name}\("):
             getattr(Student(), name)
-    with pytest.raises(ValueError, match="sing: unknown; there are: play"):
-        Student(sing=print)

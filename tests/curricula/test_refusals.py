@@ -8,14 +8,19 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 import proposer_rl as prl
 from proposer_rl import curricula as c
 from proposer_rl.meta.actions import Mixture
+from proposer_rl.meta.first_order import target_performance
+from proposer_rl.meta.rewards import TrainingStep, log_success_gain
 from proposer_rl.settings import ArgumentError
+from proposer_rl.streams import Streams
+from proposer_rl.task import NoSuccessError
 from proposer_rl.tasks.parameters import ParameterSpace, intervals
 from tests.curricula.made import SETTINGS, SPACE, TARGET, problem_agent, replay
-from tests.curricula.scripted import GivenScores
+from tests.curricula.scripted import GivenScores, Scripted, step
 
 TWO: list[c.Curriculum] = [c.SamplingCurriculum(SPACE)] * 2
 ONE, MANY, SEEDS = (ParameterSpace({"x": intervals(0, 1, n)} if n else {}) for n in (1, 5000, 0))
@@ -89,6 +94,25 @@ def test_what_is_out_of_bounds_is_named(
 def test_points_of_a_space_without_bins_are_taken_as_they_are() -> None:
     rounded(ONE, rounded=False)
     assert SEEDS.shares(SEEDS).tolist() == [1.0]
+
+
+BLIND = Scripted(torch.rand(3), told="return")
+ONLY_RETURNS = TensorDict({"return": torch.rand(1, 3)}, [1, 3])
+GAINED: Any = TrainingStep(*[ONLY_RETURNS] * 5)
+NO_SUCCESS: list[tuple[Callable[[], Any], str]] = [
+    (lambda: c.Scorer("learnability", "exact")(BLIND, torch.tensor([0, 1]), Streams(0)), ""),
+    (lambda: step(c.LearningProgressCurriculum(BLIND.space), BLIND, 0), "measure=return"),
+    (lambda: log_success_gain(GAINED), r"rewards\.performance_gain"),
+    (lambda: target_performance(ONLY_RETURNS, "log_success"), "measure=return"),
+]
+
+
+@pytest.mark.parametrize(("call", "way_out"), NO_SUCCESS)
+def test_a_task_without_success_is_told_what_to_give(call: Any, way_out: str) -> None:
+    with pytest.raises(NoSuccessError, match=f"this task tells no success.*{way_out}") as error:
+        call()
+    assert error.value.exit_code == 2
+    step(c.LearningProgressCurriculum(BLIND.space, measure="return"), BLIND, 0)
 
 
 CHECKED = """AdaptiveDifficulty AdaptiveMixture ArcLengthFilter BetaSampling BoundsCurriculum

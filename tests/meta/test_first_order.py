@@ -285,19 +285,6 @@ def test_sampled_quantities_come_nearer_to_the_exact_ones_with_more_episodes() -
     assert (cosine_of_few < cosine).all()
 
 
-def test_alignments_of_problems_add_up_to_the_batchs() -> None:
-    levels = some_levels(2, 6)
-    ppo = learner(levels)
-    rollout = ppo.collect([torch.Generator().manual_seed(k) for k in range(2)])
-    advantage = ppo_advantages(ppo, rollout)
-    direction = exact_direction(ppo, levels)
-    each = alignment(ppo.agent, direction, 1e-4, lambda: surrogate(ppo.agent, rollout, advantage))
-    batch = surrogate(ppo.agent, rollout, advantage).mean(1).sum()
-    torch.testing.assert_close(
-        each.mean(1), inner(direction, gradient(ppo.agent, batch)), rtol=1e-4, atol=1e-9
-    )
-
-
 @pytest.mark.parametrize("fails", [False, True])
 def test_moved_weights_come_back_bit_by_bit(fails: bool) -> None:
     ppo = learner(some_levels(2, 3), network=Population(lambda: UNet(channels=(8, 8)), 2, cores=1))
@@ -339,12 +326,6 @@ def test_a_target_without_any_success_is_told_in_one_line() -> None:
     with pytest.raises(DivergedError, match=told) as info:
         target_performance(TensorDict({"success": success}, [2, 2]), "log_success")
     assert "\n" not in str(info.value)
-
-
-def test_success_that_a_task_does_not_tell_is_refused() -> None:
-    told = TensorDict({"return": torch.rand(1, 3)}, [1, 3])
-    with pytest.raises(ValueError, match="this task tells no success, only the return"):
-        target_performance(told, "log_success")
 
 
 def test_scores_are_means_with_standard_errors() -> None:
