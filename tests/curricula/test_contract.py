@@ -14,17 +14,7 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from proposer_rl import curricula
-from proposer_rl.curricula import (
-    Batch,
-    Curriculum,
-    LearnedCurriculum,
-    Student,
-    TaskStudent,
-    UnfitStudentError,
-    outcome_of,
-    require,
-)
+from proposer_rl import curricula as c
 from proposer_rl.curricula.contract import proposed
 from proposer_rl.curricula.ledger import Ledger
 from proposer_rl.curricula.student import ABILITIES
@@ -52,7 +42,7 @@ class Past(NamedTuple):
     state: bytes
     snapshot: TensorDict
     life: Lived
-    curriculum: Curriculum
+    curriculum: c.Curriculum
     learner: PPO
 
 
@@ -65,7 +55,7 @@ def lived(name: str) -> Past:
     return Past(file.getvalue(), learner.snapshot(), life, curriculum, learner)
 
 
-def resumed(name: str, learner: PPO) -> tuple[Curriculum, PPO]:
+def resumed(name: str, learner: PPO) -> tuple[c.Curriculum, PPO]:
     before = lived(name)
     curriculum = EVERY[name]()
     curriculum.load_state_dict(torch.load(io.BytesIO(before.state), weights_only=True))
@@ -96,7 +86,7 @@ LOGGING = ["plr", "progress of episodes", "adaptive_mixture", "transport on a mo
 @pytest.mark.parametrize("name", LOGGING)
 def test_a_log_is_of_all_since_the_last_one_also_where_it_is_restored_in_between(name: str) -> None:
     whole, learner = resumed(name, shared())
-    student = TaskStudent(TASK, learner)
+    student = c.TaskStudent(TASK, learner)
     for number in range(2):
         batch = proposed(whole, student, P, Streams(0, "log", number))
         whole.observe(student, batch, played(student, batch, number))
@@ -139,20 +129,20 @@ def shared() -> PPO:
     return solvers([5])
 
 
-def played(student: TaskStudent, batch: Batch, number: int) -> TensorDict:
+def played(student: c.TaskStudent, batch: c.Batch, number: int) -> TensorDict:
     """What comes of a batch of any size, without training."""
     rollouts = [
         student.play(some, Streams(7, number, i).generator())
         for i, some in enumerate(batch.levels.split(P))
     ]
-    return outcome_of(torch.cat(rollouts))
+    return c.outcome_of(torch.cat(rollouts))
 
 
 def test_results_in_any_order_and_parts_are_observed_in_order() -> None:
     """Of one batch once, whatever came of it; what does not come back keeps nobody waiting."""
     ledger, levels = Ledger({"return": float}), torch.arange(9.0)
     for some in levels.split(4):
-        block = ledger.add(Batch(some))
+        block = ledger.add(c.Batch(some))
         for id in range(block.start, block.end):
             assert ledger.hand_out(id) == id
     observed = []
@@ -170,10 +160,10 @@ def test_it_asks_for_what_it_says_whatever_the_size_and_tells_what_came_back(mak
     """With a student that can do what it needs and nothing else, on batches of any size."""
     curriculum, learner = make(), solvers([0])
     assert curriculum.log() == {}
-    whole = TaskStudent(TASK, learner)
+    whole = c.TaskStudent(TASK, learner)
     can = {name: getattr(whole, name) for name in curriculum.needs}
-    student = Student(gamma=whole.gamma, lmbda=whole.lmbda, batch_size=P, **can)
-    if isinstance(curriculum, LearnedCurriculum):
+    student = c.Student(gamma=whole.gamma, lmbda=whole.lmbda, batch_size=P, **can)
+    if isinstance(curriculum, c.LearnedCurriculum):
         curriculum.improve(student, Streams(0))
     before = learner.snapshot()
     counts = [1, P + 2]
@@ -198,21 +188,27 @@ def test_a_state_of_another_class_is_refused_in_one_line(make: Make) -> None:
         make().load_state_dict({"nothing at all": 0})
 
 
-class Fewer(Curriculum):
-    def propose(self, student: Student, count: int, rng: Streams) -> Any:
+class Fewer(c.Curriculum):
+    def propose(self, student: c.Student, count: int, rng: Streams) -> Any:
         return torch.zeros(count - 1)
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: proposed(Fewer(), Student(), 4, Streams(0)), "curriculum=Fewer: proposes 3 .* 4"),
         (
-            lambda: Batch(torch.zeros(3), TensorDict({}, [4])),
+            lambda: proposed(Fewer(), c.Student(), 4, Streams(0)),
+            "curriculum=Fewer: proposes 3 .* 4",
+        ),
+        (
+            lambda: c.Batch(torch.zeros(3), TensorDict({}, [4])),
             r"notes: have shape \[4\], .* of 3",
         ),
-        (lambda: Curriculum().propose(Student(), 1, Streams(0)), "Curriculum must define propose"),
-        (lambda: Student(sing=print), "sing: unknown; there are: play"),
+        (
+            lambda: c.Curriculum().propose(c.Student(), 1, Streams(0)),
+            "Curriculum must define propose",
+        ),
+        (lambda: c.Student(sing=print), "sing: unknown; there are: play"),
     ],
 )
 def test_what_breaks_the_contract_is_refused(call: Any, message: str) -> None:
@@ -221,10 +217,10 @@ def test_what_breaks_the_contract_is_refused(call: Any, message: str) -> None:
 
 
 def test_whoever_observes_and_saves_nothing_is_told_so_once() -> None:
-    def observe(self: Any, student: Any, batch: Batch, outcome: TensorDictBase) -> None: ...
+    def observe(self: Any, student: Any, batch: c.Batch, outcome: TensorDictBase) -> None: ...
 
-    def kinds(**more: Any) -> list[type[Curriculum]]:
-        own = type("Own", (Curriculum,), {"observe": observe, **more})
+    def kinds(**more: Any) -> list[type[c.Curriculum]]:
+        own = type("Own", (c.Curriculum,), {"observe": observe, **more})
         return [own, type("Child", (own,), {})]
 
     with warnings.catch_warnings(record=True) as said:
@@ -233,7 +229,7 @@ def test_whoever_observes_and_saves_nothing_is_told_so_once() -> None:
             *kinds(state=()),
             *kinds(state=("needs",)),
             *kinds(state_dict=lambda self: {}),
-            curricula.SamplingCurriculum,
+            c.SamplingCurriculum,
         ):
             kind.__new__(kind).state_dict()
         assert not said
@@ -244,7 +240,7 @@ def test_whoever_observes_and_saves_nothing_is_told_so_once() -> None:
 
 def test_no_module_hides_a_method() -> None:
     """``proposer_rl.curricula.NAME`` is the method of that name."""
-    modules = {path.stem for path in Path(curricula.__path__[0]).glob("*.py")}
+    modules = {path.stem for path in Path(c.__path__[0]).glob("*.py")}
     assert not modules & {path.stem for path in CONFIG_FOLDER.glob("method/*.yaml")}
 
 
@@ -255,10 +251,10 @@ def test_a_student_that_lacks_something_is_named() -> None:
         (cars, "optimal_return", "MountainCarTask must define optimal_return"),
         (windows, "exact_performance", "ViewMazeTask tells performance by playing, which is not"),
     ):
-        poor = TaskStudent(task, task.learner([Streams(0)]))
-        require(poor, ("play", "probe", "performance"), "plr")
-        with pytest.raises(UnfitStudentError, match=f"it needs a student with {need}: {reason}"):
-            require(poor, (need,), "it")
+        poor = c.TaskStudent(task, task.learner([Streams(0)]))
+        c.require(poor, ("play", "probe", "performance"), "plr")
+        with pytest.raises(c.UnfitStudentError, match=f"it needs a student with {need}: {reason}"):
+            c.require(poor, (need,), "it")
     for name in ABILITIES:
-        with pytest.raises(UnfitStudentError, match=rf"{name}: it has no {name}\("):
-            getattr(Student(), name)
+        with pytest.raises(c.UnfitStudentError, match=rf"{name}: it has no {name}\("):
+            getattr(c.Student(), name)

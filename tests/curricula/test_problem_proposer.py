@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from proposer_rl import methods
+from proposer_rl import methods, models
 from proposer_rl.curricula import (
     Curriculum,
     Filtered,
@@ -20,13 +20,6 @@ from proposer_rl.curricula import (
 from proposer_rl.learning import DivergedError, PPOSettings, SolverSettings
 from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components
-from proposer_rl.models import (
-    ProblemHead,
-    ProposerNetwork,
-    categorical,
-    draw_at,
-    proposer_actor_critic,
-)
 from proposer_rl.models.actor_critic import ActorCritic
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
@@ -49,9 +42,9 @@ class Seen(Skills):
 
 def agent() -> ActorCritic:
     torch.manual_seed(0)
-    head = ProblemHead(8, P, BINS, hidden=16, bands=4)
-    network = ProposerNetwork(head, nn.Linear(3, 8), context=8, hidden=8)
-    return proposer_actor_critic(network, categorical)
+    head = models.ProblemHead(8, P, BINS, hidden=16, bands=4)
+    network = models.ProposerNetwork(head, nn.Linear(3, 8), context=8, hidden=8)
+    return models.proposer_actor_critic(network, models.categorical)
 
 
 def ppo(**settings: Any) -> PPOSettings:
@@ -81,7 +74,7 @@ def step_by_hand(expected: ActorCritic, streams: Streams, times: int, kept: slic
     seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
     policy = torch.distributions.Categorical(logits=expected(seen)["logits"][0])
     noise = torch.rand(times, 1, P, generator=streams.generator("choices"))
-    choices = draw_at(policy, noise)[kept]  # [times, 1, P]
+    choices = models.draw_at(policy, noise)[kept]  # [times, 1, P]
     paid = torch.tensor(WANTED)[choices]  # up to a factor, which standardising takes out
     advantage = (paid - paid.mean()) / paid.std()
     loss = -(advantage * policy.log_prob(choices)).mean() - 0.3 * policy.entropy().mean()

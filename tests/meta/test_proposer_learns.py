@@ -10,16 +10,9 @@ import torch
 from torch import nn
 from torchrl.objectives import A2CLoss, LossModule, ReinforceLoss
 
+from proposer_rl import models
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, PPOSettings
 from proposer_rl.meta.actions import ProblemChoices
-from proposer_rl.models import (
-    MixtureHead,
-    ProblemHead,
-    ProposerNetwork,
-    categorical,
-    normal,
-    proposer_actor_critic,
-)
 from proposer_rl.streams import Streams
 from tests.skill_ladder import any_mixture, best_constant, best_sequence, even, ladder_env
 
@@ -34,8 +27,8 @@ def problem_choices() -> PPO:
         problems=PROBLEMS,
         meta_episode_length=UPDATES,
     )
-    head = ProblemHead(33, PROBLEMS, SKILLS, hidden=32)
-    return _ppo(env, head, categorical, None)
+    head = models.ProblemHead(33, PROBLEMS, SKILLS, hidden=32)
+    return _ppo(env, head, models.categorical, None)
 
 
 def mixtures(*, idle: int = 0, action_repeat: int = 1, shuffled: bool = False, **learning) -> PPO:
@@ -50,7 +43,11 @@ def mixtures(*, idle: int = 0, action_repeat: int = 1, shuffled: bool = False, *
         action_repeat=action_repeat,
     )
     return _ppo(
-        env, MixtureHead(33, SKILLS + idle, hidden=32), normal, LeaveOneOutBaseline(1.0), **learning
+        env,
+        models.MixtureHead(33, SKILLS + idle, hidden=32),
+        models.normal,
+        LeaveOneOutBaseline(1.0),
+        **learning,
     )
 
 
@@ -64,8 +61,8 @@ def other_loss(kind: type[LossModule]) -> Callable[..., PPO]:
 
 
 def _ppo(env, head, distribution, advantage, *, loss=None, **numbers) -> PPO:
-    network = ProposerNetwork(head, nn.Linear(SKILLS, 32), numbers=1, context=32, hidden=32)
-    agent = proposer_actor_critic(network, distribution, ["probes", "progress"])
+    network = models.ProposerNetwork(head, nn.Linear(SKILLS, 32), numbers=1, context=32, hidden=32)
+    agent = models.proposer_actor_critic(network, distribution, ["probes", "progress"])
     numbers = {"epochs": 4, "learning_rate": 1e-2, **numbers}
     settings = PPOSettings(horizon=env.steps, gamma=1.0, **numbers)
     return PPO(env, agent, settings, advantage=advantage, loss=loss)
