@@ -227,17 +227,6 @@ def test_short_differences_tell_the_derivative_also_in_wide_networks(
     assert agreement(RATE) < agreement(RATE / 20)
 
 
-def test_a_solvers_numbers_do_not_depend_on_those_beside_it() -> None:
-    target, levels = some_levels(2, 5), some_levels(2, 4)
-    both, alone = learner(target), learner(target[1:], 1)
-    alone.restore(both.snapshot()[1:])
-
-    def scores(ppo: PPO, which: slice) -> Tensor:
-        return aligned(ppo, exact_direction(ppo, target[which]), levels[which])
-
-    torch.testing.assert_close(scores(both, slice(0, 2))[1:], scores(alone, slice(1, 2)))
-
-
 def ppo_advantages(ppo: PPO, rollout: TensorDict) -> Tensor:
     """What training weights log-probabilities with, float [K, P, T]: not standardised here."""
     assert not ppo.settings.normalize_advantage

@@ -29,21 +29,16 @@ def rollout(channels: int = 3) -> TensorDict:
     return TensorDict({"planes": planes, "agent": agent}, [K, P, T])
 
 
-def test_decoding_a_context_equals_a_pass_per_transition() -> None:
-    agent, steps = solver(), rollout()
+@pytest.mark.parametrize("per_step", [False, True])
+def test_decoding_a_context_equals_a_pass_per_transition(per_step: bool) -> None:
+    agent, steps = solver(per_step), rollout(4 if per_step else 3)
+    assert bool(agent.level_keys) != per_step  # where each step has its own, nothing is shared
     slow = agent(steps.clone())
-    fast = agent.decode(steps.select("agent"), agent.encode(steps[..., 0]))
+    shown = steps.clone() if per_step else steps.select("agent")
+    fast = agent.decode(shown, agent.encode(steps[..., 0]))
     assert fast["logits"].shape == (K, P, T, 4)
     for key in ("logits", "state_value"):
         torch.testing.assert_close(fast[key], slow[key], rtol=1e-4, atol=1e-5)
-
-
-def test_without_an_encoder_decoding_is_a_pass_per_transition() -> None:
-    agent, steps = solver(per_step=True), rollout(4)
-    assert agent.level_keys == []
-    slow = agent(steps.clone())
-    fast = agent.decode(steps.clone(), agent.encode(steps[..., 0]))
-    assert torch.equal(fast["logits"], slow["logits"])
 
 
 def test_a_network_without_copies_is_an_ordinary_actor() -> None:
