@@ -100,12 +100,10 @@ class SolverSettings:
     ppo: PPOSettings = PPOSettings()
 
 
-def gae(gamma: float, lmbda: float, value_key: str) -> GAE:
+def gae(gamma: float, lmbda: float) -> GAE:
     """Returns TorchRL's generalised advantage estimation, of values that stand in the rollout."""
     # Its vectorised form splits the batch where episodes end, which it has to look up.
-    estimator = GAE(gamma=gamma, lmbda=lmbda, value_network=None, vectorized=False)
-    estimator.set_keys(value=value_key)
-    return estimator
+    return GAE(gamma=gamma, lmbda=lmbda, value_network=None, vectorized=False)
 
 
 class LeaveOneOutBaseline(TensorDictModuleBase):
@@ -166,9 +164,6 @@ def make_loss(make: MakeLoss, agent: ActorCritic) -> LossModule:
     loss = make(*agent.readout())
     if loss.reduction != "none":
         raise ValueError(f'reduction of the loss must be "none", got {loss.reduction!r}')
-    loss.set_keys(
-        action=agent.action_key, sample_log_prob=agent.log_prob_key, value=agent.value_key
-    )
     return loss.to(next(agent.parameters()).device)
 
 
@@ -244,9 +239,9 @@ def of_copies(numbers: Tensor, copies: int | None) -> Tensor:
     return numbers.flatten(0 if copies is None else 1).mean(-1)
 
 
-def explained_variance(steps: TensorDictBase, value_key: str, copies: int | None) -> Tensor:
+def explained_variance(steps: TensorDictBase, copies: int | None) -> Tensor:
     """Returns the share of the targets' variance that the values explain, [K] or []."""
-    value, target = steps[value_key].detach(), steps["value_target"]
+    value, target = steps["state_value"].detach(), steps["value_target"]
     batch = 0 if copies is None else 1
     residual, total = (x.flatten(batch).var(-1, correction=0) for x in (target - value, target))
     return 1 - residual / total.clamp_min(1e-12)

@@ -30,6 +30,7 @@ from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_
 from proposer_rl.learning.training_batch import Minibatches, Statistics
 from proposer_rl.models import ActorCritic, Population, one_copy
 
+VALUES = ("state_value", ("next", "state_value"))
 DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # beside the terms, where a loss has them
 
 
@@ -89,9 +90,7 @@ class PPO:
         )
         self._minibatches = Minibatches(agent, env.batch_size, settings)
         self.statistics = Statistics(env, agent, settings)
-        self._advantage = advantage or objective.gae(
-            settings.gamma, settings.lmbda, agent.value_key
-        )
+        self._advantage = advantage or objective.gae(settings.gamma, settings.lmbda)
         clipped = partial(
             objective.CopiesClipLoss,
             copies=agent.copies,
@@ -187,19 +186,19 @@ class PPO:
             ``gradient_steps`` [S] or [S, K], the metrics of each; and of the ``steps`` what is
             computed here: values, advantages and targets.
         """
-        steps, level, value = batch["steps"].copy(), batch["level"], self.agent.value_key
+        steps, level = batch["steps"].copy(), batch["level"]
         taken = []
         for update in range(self.settings.updates):
             if update:
                 set_values(self.agent, steps, level)
             self._advantage(steps)
             if self.settings.clip_value is not None:
-                steps.set(objective.ACTED_VALUE, steps[value])
+                steps.set(objective.ACTED_VALUE, steps["state_value"])
             for epoch in range(self.settings.epochs):
                 order = batch.get(f"order_{update}_{epoch}", None)
                 parts = self._minibatches(steps, level, order)
                 taken += [self._gradient_step(*part) for part in parts]
-        computed = steps.select(value, ("next", value), "advantage", "value_target")
+        computed = steps.select(*VALUES, "advantage", "value_target")
         return TensorDict({"steps": computed, "gradient_steps": TensorDict.stack(taken)})
 
     def _gradient_step(self, steps: TensorDictBase, level: TensorDictBase) -> TensorDict:
@@ -224,7 +223,7 @@ class PPO:
             if key.startswith("loss_") or key in DIAGNOSTICS
         }
         terms = [metric for key, metric in metrics.items() if key.startswith("loss_")]
-        metrics["explained_variance"] = objective.explained_variance(steps, agent.value_key, copies)
+        metrics["explained_variance"] = objective.explained_variance(steps, copies)
         return torch.stack(terms).sum(), {key: metric.detach() for key, metric in metrics.items()}
 
     def complete(self, rollout: TensorDictBase) -> TensorDictBase:

@@ -33,14 +33,13 @@ class ActorCritic(TensorDictModuleBase):
     the same numbers and T times less arithmetic.
 
     Args:
-        head: reads the encoder's outputs and the observation of a step, writes ``logits_key`` and
-            ``value_key``. With an encoder, every other input may carry time dimensions behind the
+        head: reads the encoder's outputs and the observation of a step, writes ``logits`` and
+            ``state_value``. With an encoder, every other input may carry time dimensions behind the
             batch ones, [*B, *T, ...], and the outputs then carry them too.
         encoder: reads what is constant within a level; None where nothing is.
         distribution_class: builds the action's distribution from ``logits=``.
         copies: K if parameters and data carry independent replicas as their first dimension
             (:class:`~proposer_rl.models.Population`), None for a single network.
-        action_key, log_prob_key, logits_key, value_key: the entries' names.
         memory: of a head that state, the widths of its memory by the entries' names: it reads
             them, zeros at first, writes them below ``next``, and goes through time where TorchRL's
             ``recurrent_mode()`` says so (:func:`~proposer_rl.models.memory_actor_critic`).
@@ -56,10 +55,6 @@ class ActorCritic(TensorDictModuleBase):
         *,
         distribution_class: Callable[..., Distribution] = Categorical,
         copies: int | None = None,
-        action_key: str = "action",
-        log_prob_key: str = "action_log_prob",
-        logits_key: str = "logits",
-        value_key: str = "state_value",
         memory: Mapping[str, int] | None = None,
     ) -> None:
         super().__init__()
@@ -67,17 +62,13 @@ class ActorCritic(TensorDictModuleBase):
         self.encoder = encoder
         self.distribution_class = distribution_class
         self.copies = copies
-        self.action_key = action_key
-        self.log_prob_key = log_prob_key
-        self.logits_key = logits_key
-        self.value_key = value_key
         self.level_keys = list(encoder.in_keys) if encoder is not None else []
         self.context_keys = list(encoder.out_keys) if encoder is not None else []
         self.step_keys = [key for key in head.in_keys if key not in self.context_keys]
         self.in_keys = [*self.level_keys, *self.step_keys]
         self.memory = dict(memory or {})
         self.memory_keys = [("next", key) for key in self.memory]
-        self.out_keys = [logits_key, value_key, *self.memory_keys]
+        self.out_keys = ["logits", "state_value", *self.memory_keys]
         self.normalization: Normalization | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -112,8 +103,8 @@ class ActorCritic(TensorDictModuleBase):
         if self.normalization is None:
             return self.head(inputs)
         outputs = self.head(self.normalization.seen(inputs))
-        value = outputs.get(self.value_key)
-        return outputs.set(self.value_key, value * self.normalization.unit(value))
+        value = outputs.get("state_value")
+        return outputs.set("state_value", value * self.normalization.unit(value))
 
     def no_memory(self, tensordict: TensorDictBase) -> TensorDict:
         """Returns the memory before the first step of a batch [*B]: zeros."""
@@ -124,16 +115,16 @@ class ActorCritic(TensorDictModuleBase):
 
     def distribution(self, tensordict: TensorDictBase) -> Distribution:
         """Returns the action's distribution, given a tensordict with logits."""
-        return self.distribution_class(logits=tensordict.get(self.logits_key))
+        return self.distribution_class(logits=tensordict.get("logits"))
 
     def sampler(self, *, sample: bool = False) -> ProbabilisticTensorDictModule:
         """Returns the module from logits to an action and its probability; see :meth:`actor`."""
         return ProbabilisticTensorDictModule(
-            in_keys={"logits": self.logits_key},
-            out_keys=[self.action_key],
+            in_keys=["logits"],
+            out_keys=["action"],
             distribution_class=self.distribution_class,
             return_log_prob=True,
-            log_prob_key=self.log_prob_key,
+            log_prob_key="action_log_prob",
             default_interaction_type=getattr(
                 InteractionType, "RANDOM" if sample else "DETERMINISTIC"
             ),
@@ -170,8 +161,8 @@ class ActorCritic(TensorDictModuleBase):
         For a TorchRL loss whose caller has run this module already, so that actor and critic share
         one forward pass.
         """
-        logits = TensorDictModule(nn.Identity(), [self.logits_key], [self.logits_key])
-        value = TensorDictModule(nn.Identity(), [self.value_key], [self.value_key])
+        logits = TensorDictModule(nn.Identity(), ["logits"], ["logits"])
+        value = TensorDictModule(nn.Identity(), ["state_value"], ["state_value"])
         return ProbabilisticTensorDictSequential(logits, self.sampler()), value
 
 

@@ -230,7 +230,7 @@ def test_short_differences_tell_the_derivative_also_in_wide_networks(
 def ppo_advantages(ppo: PPO, rollout: TensorDict) -> Tensor:
     """What training weights log-probabilities with, float [K, P, T]: not standardised here."""
     assert not ppo.settings.normalize_advantage
-    estimate = gae(ppo.settings.gamma, ppo.settings.lmbda, ppo.agent.value_key)
+    estimate = gae(ppo.settings.gamma, ppo.settings.lmbda)
     return estimate(rollout.copy())["advantage"].squeeze(-1)
 
 
