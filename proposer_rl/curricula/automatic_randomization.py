@@ -9,8 +9,8 @@ from annotated_types import Interval
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
-from proposer_rl.curricula.contract import Batch, Curriculum
+from proposer_rl.curricula.bins import CountingCurriculum, Measure
+from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.points import Place, Points, refuse_crossed
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import Count, checked
@@ -20,7 +20,7 @@ from proposer_rl.task import Space
 INSIDE = -1  # of a point that lies on no bound
 
 
-class BoundsCurriculum(Curriculum):
+class BoundsCurriculum(CountingCurriculum):
     """Draws levels uniformly within bounds, which move outwards where the student succeeds.
 
     A level is a point of the box [-1, 1]^D that the space's coordinates span. There are a lower and
@@ -70,14 +70,14 @@ class BoundsCurriculum(Curriculum):
         rounded: bool = True,
     ) -> None:
         refuse_crossed(lower, upper)
-        self.space, self._points = space, Points(space, rounded)
+        super().__init__(space)
+        self._points = Points(space, rounded)
         self.required_results = ("success",) if measure == "success" else ()
         self._start, self._step = self._points.at(start), step
         self._lower, self._upper = lower, upper
         self._episodes, self._boundary, self._measure = episodes, boundary, measure
         # Of the numbers of bounds that move, 2 d and 2 d + 1 are coordinate d's.
         self._movable = (2 * self._points.free.unsqueeze(-1) + torch.arange(2)).flatten()
-        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self.bounds = self._start.expand(2, -1).mT.clone()
         # What the levels on each bound came to since it has moved, and how many, [2 D].
         self._sums = torch.zeros(2 * self._points.size, dtype=torch.float64)
@@ -91,7 +91,7 @@ class BoundsCurriculum(Curriculum):
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Moves the bounds by what levels on them came to."""
-        self._counts += counts_of_bins(batch.notes["bins"], self.space)
+        super().observe(student, batch, outcome)
         on_bound = batch.notes["bound"] != INSIDE
         reached = outcome[self._measure].double().cpu()
         seen = batch.notes["bound"], batch.notes["at"], reached
@@ -113,10 +113,9 @@ class BoundsCurriculum(Curriculum):
         """Returns counts of levels by bin, the bounds, and the mean width between them."""
         if not bool(self._counts.any()):
             return {}
-        counts, self._counts = self._counts, torch.zeros_like(self._counts)
         widths = self.bounds.diff(dim=-1).squeeze(-1)[self._points.free]
         return {
-            "histogram": along_axes(counts, self.space),
+            "histogram": self.histogram(),
             "bounds": self.bounds.tolist(),
             "width": float(widths.mean()),
         }

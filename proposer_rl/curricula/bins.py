@@ -21,7 +21,30 @@ from proposer_rl.task import NoSuccessError, Space, refuse_unfit_bins
 Measure = Literal["success", "return"]
 
 
-class BinCurriculum(Curriculum):
+class CountingCurriculum(Curriculum):
+    """Counts how many levels of each bin came back, for the log.
+
+    The notes of its batches have the ``bins`` of the levels, int64 [n].
+
+    Args:
+        space: that has the bins.
+    """
+
+    def __init__(self, space: Space) -> None:
+        self.space = space
+        self._counts = torch.zeros(space.size, dtype=torch.int64)
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Counts the levels."""
+        self._counts += batch.notes["bins"].bincount(minlength=self.space.size)
+
+    def histogram(self) -> list[Any]:
+        """Returns the counts since the last call, as lists that are nested along the axes."""
+        counts, self._counts = self._counts, torch.zeros_like(self._counts)
+        return along_axes(counts, self.space)
+
+
+class BinCurriculum(CountingCurriculum):
     """Draws batches from shares of the bins, which it renews now and then in a scoring pass.
 
     A subclass says what a scoring pass is, what the shares are made of, and what is learnt from
@@ -39,9 +62,8 @@ class BinCurriculum(Curriculum):
     @checked
     def __init__(self, space: Space, *, every: Count) -> None:
         refuse_unfit_bins(space)
-        self.space, self._every = space, every
-        self._proposed = 0
-        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
+        super().__init__(space)
+        self._every, self._proposed = every, 0
         self.scores: dict[str, Tensor] = {}  # what the shares come from, each [N], on the CPU
 
     @abstractmethod
@@ -66,32 +88,20 @@ class BinCurriculum(Curriculum):
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Counts the levels, and learns from what came of them."""
-        bins = batch.notes["bins"]
-        self._counts += counts_of_bins(bins, self.space)
-        self.learn(bins, outcome)
+        super().observe(student, batch, outcome)
+        self.learn(batch.notes["bins"], outcome)
 
     def log(self) -> dict[str, Any]:
         """Returns counts of levels by bin, the scores, and how even the shares are."""
         if not self.scores:
             return {}
-        shares, counts = self.shares(), self._counts
-        self._counts = torch.zeros_like(counts)
+        shares = self.shares()
         return {
-            "histogram": along_axes(counts, self.space),
+            "histogram": self.histogram(),
             **{name: along_axes(self.scores[name], self.space) for name in self.shown},
             "share_entropy": float(torch.special.entr(shares).sum()),
             "effective_bins": float(1 / shares.square().sum()),
         }
-
-
-def counts_of_bins(bins: Tensor, space: Space) -> Tensor:
-    """Counts the levels of each of a space's N bins: int64 [N].
-
-    Args:
-        bins: of the levels, int64 of any shape.
-        space: that has the bins.
-    """
-    return bins.flatten().bincount(minlength=space.size)
 
 
 def along_axes(values: Tensor, space: Space) -> list[Any]:

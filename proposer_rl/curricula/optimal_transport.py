@@ -82,7 +82,9 @@ class TransportCurriculum(BinCurriculum):
         self._delta, self._epsilon = delta, epsilon
         self._probes = Probes(space, probes, measure)
         self._target = (target_shares.double() / target_shares.double().sum()).numpy()
-        self._costs = squared_distances(space)
+        places = space.coordinates.double()
+        apart = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
+        self._costs = apart.square().numpy()  # [N, N]
 
     @classmethod
     def create(cls, run: Components, **settings: Any) -> TransportCurriculum:
@@ -92,10 +94,11 @@ class TransportCurriculum(BinCurriculum):
     def score(self, student: Student, count: int, rng: Streams) -> None:
         """Moves the distribution by the student's performance on the probes."""
         performance = self._probes.performance(student, rng)
-        allowed = mastered(performance, self._delta)
+        # Where no bin is mastered, those of the best performance are allowed.
+        allowed = performance >= performance.max().clamp(max=self._delta)
         even = torch.full(performance.shape, 1 / len(performance), dtype=torch.float64)
-        now, costs = self.scores.get("share", even).numpy(), self._costs.numpy()
-        moved, left = step_towards(self._target, now, costs, allowed.numpy(), self._epsilon)
+        now = self.scores.get("share", even).numpy()
+        moved, left = step_towards(self._target, now, self._costs, allowed.numpy(), self._epsilon)
         share = torch.from_numpy(moved)
         share = share.where(share > NOTHING, 0.0)
         self.scores = {
@@ -119,22 +122,6 @@ class TransportCurriculum(BinCurriculum):
             record["allowed_bins"] = int(self.scores["allowed"].sum())
             record["target_distance"] = float(self.scores["distance"])
         return record
-
-
-def squared_distances(space: Space) -> Tensor:
-    """Returns the squared distances between the bins of a space: float64 [N, N]."""
-    places = space.coordinates.double()
-    return torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist").square()
-
-
-def mastered(performance: Tensor, delta: float) -> Tensor:
-    """Returns which bins are mastered, bool [*B, N]: where none is, those of the best performance.
-
-    Args:
-        performance: in each bin, float [*B, N].
-        delta: least performance of a mastered bin.
-    """
-    return performance >= performance.amax(-1, keepdim=True).clamp(max=delta)
 
 
 def step_towards(

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 
 from proposer_rl.curricula.batches import device_of, levels_in
-from proposer_rl.curricula.bins import along_axes, counts_of_bins
-from proposer_rl.curricula.contract import Batch, Curriculum
+from proposer_rl.curricula.bins import CountingCurriculum
+from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.proposer import learnt_proposer
 from proposer_rl.curricula.student import Student, TaskStudent
 from proposer_rl.learning import PPO, PPOSettings, load_agent, located
@@ -26,7 +26,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space, Task, refuse_unfit_bins
 
 
-class ProblemProposer(Curriculum):
+class ProblemProposer(CountingCurriculum):
     """Draws each of P problems from a policy, and trains it by the reward of each.
 
     At every proposal the policy sees what the student would do on probe levels of the target, draws
@@ -60,7 +60,8 @@ class ProblemProposer(Curriculum):
         probe_levels: int = 16,
     ) -> None:
         refuse_unfit_bins(space)
-        self.agent, self.space, self.target = agent, space, target
+        super().__init__(space)
+        self.agent, self.target = agent, target
         self._settings, self._probe_levels = settings, probe_levels
         actor, _ = agent.readout()
         self._loss = ClipPPOLoss(
@@ -75,7 +76,6 @@ class ProblemProposer(Curriculum):
         self._adam = torch.optim.Adam(
             self._parameters, lr=settings.learning_rate, eps=settings.adam_eps
         )
-        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._metrics: dict[str, float] = {}
 
     @abstractmethod
@@ -114,16 +114,11 @@ class ProblemProposer(Curriculum):
         self._metrics |= metrics
         return Batch(levels[:count], TensorDict({"bins": bins[:count]}, [count]))
 
-    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Counts the levels that came back."""
-        self._counts += counts_of_bins(batch.notes["bins"], self.space)
-
     def log(self) -> dict[str, Any]:
         """Returns the last metrics of the policy, and how many levels of each bin came back."""
         if not self._metrics:
             return {}
-        counts, self._counts = self._counts, torch.zeros_like(self._counts)
-        return {**self._metrics, "histogram": along_axes(counts, self.space)}
+        return {**self._metrics, "histogram": self.histogram()}
 
     def learnt(self) -> dict[str, Any]:
         """Returns the Proposer, without its optimiser."""

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
-from proposer_rl.curricula.contract import Batch, Curriculum
+from proposer_rl.curricula.bins import CountingCurriculum, Measure
+from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.points import Place, Points
 from proposer_rl.curricula.student import Student
 from proposer_rl.meta.assembly import Components
@@ -30,7 +30,7 @@ SAMPLED = 1000  # levels of the target, whose mean and deviation are taken
 SLACK = 1e-4  # of the constraints, within which a solution is taken
 
 
-class SelfPacedCurriculum(Curriculum):
+class SelfPacedCurriculum(CountingCurriculum):
     """Draws levels from a Gaussian that moves towards the target's.
 
     A level is a point of the box [-1, 1]^D that the space's coordinates span, drawn from a normal
@@ -81,7 +81,8 @@ class SelfPacedCurriculum(Curriculum):
         measure: Measure = "success",
         rounded: bool = True,
     ) -> None:
-        self.space, self._points = space, Points(space, rounded)
+        super().__init__(space)
+        self._points = Points(space, rounded)
         self.required_results = ("success",) if measure == "success" else ()
         self._limits = delta, epsilon, least_deviation
         self._every, self._measure = episodes, measure
@@ -99,7 +100,6 @@ class SelfPacedCurriculum(Curriculum):
         # Since the last step: points [m, D], their log densities and performance [m].
         self._episodes: list[dict[str, Tensor]] = []
         self._expected: float | None = None  # performance at the last step
-        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
 
     @classmethod
     def create(cls, run: Components, **settings: Any) -> SelfPacedCurriculum:
@@ -118,7 +118,7 @@ class SelfPacedCurriculum(Curriculum):
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Adds episodes, and makes a step where there are enough."""
-        self._counts += counts_of_bins(batch.notes["bins"], self.space)
+        super().observe(student, batch, outcome)
         some = {name: batch.notes[name] for name in ("points", "log_density")}
         self._episodes.append({**some, "reached": outcome[self._measure].double().cpu()})
         if sum(len(some["reached"]) for some in self._episodes) >= self._every:
@@ -128,9 +128,8 @@ class SelfPacedCurriculum(Curriculum):
         """Returns counts of levels by bin, the Gaussian, and how far it is from the target."""
         if not bool(self._counts.any()):
             return {}
-        counts, self._counts = self._counts, torch.zeros_like(self._counts)
         return {
-            "histogram": along_axes(counts, self.space),
+            "histogram": self.histogram(),
             "means": self.mean.tolist(),
             "deviations": self.deviation.tolist(),
             "target_divergence": divergence(self._now, self._target)[0],

@@ -11,8 +11,8 @@ from annotated_types import Ge
 from tensordict import TensorDict, TensorDictBase
 
 from proposer_rl.curricula.batches import levels_in
-from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
-from proposer_rl.curricula.contract import Batch, Curriculum
+from proposer_rl.curricula.bins import CountingCurriculum, Measure
+from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.points import refuse_crossed
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import ArgumentError, checked
@@ -20,7 +20,7 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import Space, refuse_many_bins
 
 
-class RowsCurriculum(Curriculum):
+class RowsCurriculum(CountingCurriculum):
     """The rule of ``legged_gym`` for robots on terrains whose rows are harder and harder.
 
     A robot whose level in row r came to at least ``upper`` gets one in row r + 1 next, one whose
@@ -71,10 +71,10 @@ class RowsCurriculum(Curriculum):
         refuse_many_bins(space)
         # The number of a bin is (before * rows + row) * after + rest.
         self._before, self._after = prod(sizes[:axis]), prod(sizes[axis + 1 :])
-        self.space, self._start = space, min(start, self._rows - 1)
+        super().__init__(space)
+        self._start = min(start, self._rows - 1)
         self.required_results = ("success",) if measure == "success" else ()
         self._lower, self._upper, self._measure = lower, upper, measure
-        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._last = torch.zeros(0, dtype=torch.int64)  # rows of the last batch, [n]
         self._queue = torch.zeros(0, dtype=torch.int64)  # rows [m] of the next levels
 
@@ -92,9 +92,9 @@ class RowsCurriculum(Curriculum):
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Appends the rows that follow to those that are next."""
+        super().observe(student, batch, outcome)
         reached = outcome[self._measure].double().cpu()
         move = (reached >= self._upper).long() - (reached < self._lower).long()
-        self._counts += counts_of_bins(batch.notes["bins"], self.space)
         self._queue = torch.cat([self._queue, (batch.notes["row"] + move).clamp(min=0)])
 
     def log(self) -> dict[str, Any]:
@@ -104,9 +104,8 @@ class RowsCurriculum(Curriculum):
         """
         if not len(self._last):
             return {}
-        counts, self._counts = self._counts, torch.zeros_like(self._counts)
         return {
-            "histogram": along_axes(counts, self.space),
+            "histogram": self.histogram(),
             "mean_row": float(self._last.double().mean()),
             "last_row": float((self._last == self._rows - 1).double().mean()),
         }

@@ -97,27 +97,16 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
 def target_direction(learner: PPO | Replica, performance: Tensor) -> dict[str, Tensor]:
     """Returns the target direction of K Solvers, each scaled to a root mean square of 1.
 
+    It is the gradient of the performance, divided by what Adam divides its step by. Before Adam's
+    first step there is no second moment, and nothing is divided.
+
     Args:
-        learner: whose agent the performance is of.
+        learner: whose agent the performance is of, and whose Adam says how steps are scaled.
         performance: exact R of each Solver, float [K], with gradients towards the agent's
             parameters; see :func:`target_performance`.
 
     Raises:
         DivergedError: if the gradient of a Solver is zero, or not finite.
-    """
-    direction = in_adams_units(learner, performance)
-    _require_none(root_mean_square(direction) == 0, "the target direction is zero")
-    return scaled(direction)
-
-
-def in_adams_units(learner: PPO | Replica, performance: Tensor) -> dict[str, Tensor]:
-    """Returns the gradient of a performance, divided by what Adam divides its step by.
-
-    Before Adam's first step there is no second moment, and nothing is divided.
-
-    Args:
-        learner: whose agent the performance is of, and whose Adam says how steps are scaled.
-        performance: of each Solver, float [K], with gradients towards the agent's parameters.
     """
     parameters = trainable(learner.agent)
     gradients = torch.autograd.grad(
@@ -130,24 +119,15 @@ def in_adams_units(learner: PPO | Replica, performance: Tensor) -> dict[str, Ten
         bias = 1 - SECOND_MOMENT_DECAY**step
         moment = torch.where(step > 0, state[name, "exp_avg_sq"] / bias, torch.ones_like(gradient))
         direction[name] = gradient / (moment.sqrt() + learner.settings.adam_eps)
-    return direction
+    size = root_mean_square(direction)
+    _require_none(size == 0, "the target direction is zero")
+    _require_none(~size.isfinite(), "the target direction is not finite")
+    return {name: entry / expand_as_right(size, entry) for name, entry in direction.items()}
 
 
 def trainable(agent: nn.Module) -> dict[str, nn.Parameter]:
     """Returns the parameters of an agent by their names, without those that are frozen."""
     return {name: p for name, p in agent.named_parameters() if p.requires_grad}
-
-
-def scaled(direction: Direction) -> dict[str, Tensor]:
-    """Returns a direction of K Solvers, each scaled to a root mean square of 1; zero stays zero.
-
-    Raises:
-        DivergedError: if that of a Solver is not finite.
-    """
-    size = root_mean_square(direction)
-    _require_none(~size.isfinite(), "the target direction is not finite")
-    size = torch.where(size > 0, size, torch.ones_like(size))
-    return {name: entry / expand_as_right(size, entry) for name, entry in direction.items()}
 
 
 def _require_none(wrong: Tensor, why: str) -> None:
