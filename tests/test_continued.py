@@ -16,7 +16,7 @@ from tensordict import TensorDict, TensorDictBase
 from proposer_rl import curricula as c
 from proposer_rl.curricula.contract import outcome_of_episodes
 from proposer_rl.experiment.continued import ContinuedLevels
-from proposer_rl.experiment.side_by_side import SideBySide
+from proposer_rl.experiment.loop import SideBySide
 from proposer_rl.learning import PPOSettings, RolloutCollector, SolverSettings
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams

@@ -114,13 +114,8 @@ def unpacked(state: Mapping[str, Any], like: Any) -> Any:
         }
         made: Any = TensorDict(entries).auto_batch_size_(1)
     else:
-        made = of_kind(like, state).clone()
+        made = type(like).from_dict(state, batch_dims=1).clone()
     return moved(made, device_of(like)) if len([*like.keys(True, True)]) else made
-
-
-def of_kind(like: Levels, state: Mapping[str, Any]) -> Levels:
-    """Returns levels [m] of the class of ``like``, from nested dicts of their entries."""
-    return type(like).from_dict(state, batch_dims=1)
 
 
 def finite(name: str, numbers: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
-from proposer_rl.curricula.batches import device_of, moved, of_kind, packed
+from proposer_rl.curricula.batches import packed, unpacked
 from proposer_rl.curricula.contract import Batch
 from proposer_rl.settings import ArgumentError
 from proposer_rl.task import Levels
@@ -251,7 +251,7 @@ class Ledger:
         """
         self.blocks = []
         for kept in state["blocks"]:
-            levels = moved(of_kind(like, kept["levels"]), device_of(like))
+            levels = unpacked(kept["levels"], like)
             places = kept["places"]
             some = levels if places is None else levels[places]
             notes: Any = TensorDict.from_dict(dict(kept["notes"]), batch_size=some.shape[:1])

@@ -17,7 +17,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.batches import device_of, moved, of_kind, packed
+from proposer_rl.curricula.batches import packed, unpacked
 from proposer_rl.curricula.contract import Batch, Curriculum, outcome_of_episodes, proposed
 from proposer_rl.curricula.ledger import Ledger
 from proposer_rl.curricula.student import Student
@@ -130,7 +130,7 @@ class Queue:
     def load_state_dict(self, state: Mapping[str, Any], device: torch.device | None) -> None:
         """Puts back what :meth:`state_dict` returned; episodes go to a device."""
         self._at, self._most = state["at"], state["most"]
-        self.levels = _of_kind(self.levels, state["levels"])
+        self.levels = unpacked(state["levels"], self.levels)
         self._playing, self.steps = list(state["playing"]), state["steps"].clone()
         self._ledger.load_state_dict(state["ledger"], self.levels, device)
 
@@ -245,7 +245,7 @@ class ContinuedLevels:
             if shown is not None:
                 levels, episodes = shown
                 self._shown[k] = (
-                    _of_kind(self._queues[k].levels, levels),
+                    unpacked(levels, self._queues[k].levels),
                     TensorDict.from_dict(episodes, batch_dims=2).to(device),
                 )
         if state["history"] is not None:
@@ -258,8 +258,3 @@ class ContinuedLevels:
         if state["memory"] is not None:
             memory = TensorDict.from_dict(state["memory"], batch_dims=2)
             self._learner.collector.memory = memory.to(device)
-
-
-def _of_kind(like: Levels, state: Mapping[str, Any]) -> Levels:
-    """Returns levels of the class and on the device of others, from nested dicts."""
-    return moved(of_kind(like, state), device_of(like))
