@@ -1,4 +1,4 @@
-"""Automatic domain randomization: bounds of each parameter that move by what is reached on them."""
+"""Automatic domain randomization (ADR): the range of each parameter widens with success."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ INSIDE = -1  # of a point that lies on no bound
 
 
 class BoundsCurriculum(CountingCurriculum):
-    """Draws levels uniformly within bounds, which move outwards where the student succeeds.
+    """Draws levels uniformly within bounds that move outwards where the student succeeds.
 
     A level is a point of the box [-1, 1]^D that the space's coordinates span. There are a lower and
     an upper bound of every coordinate, which begin at one point. A part of the levels lie on a
@@ -84,13 +84,13 @@ class BoundsCurriculum(CountingCurriculum):
         self._played = torch.zeros(2 * self._points.size, dtype=torch.int64)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Draws points within the bounds and on them, and returns levels [n] there."""
+        """Draws points within the bounds or on them, and returns the levels [n] there."""
         points, which, places = self._draw(count, rng.generator("choices"))
         levels, bins = self._points.levels(points, rng)
         return Batch(levels, TensorDict({"bins": bins, "bound": which, "at": places}, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Moves the bounds by what levels on them came to."""
+        """Moves the bounds by the results of the levels that lay on them."""
         super().observe(student, batch, outcome)
         on_bound = batch.notes["bound"] != INSIDE
         reached = outcome[self._measure].double().cpu()
@@ -110,7 +110,7 @@ class BoundsCurriculum(CountingCurriculum):
             each.copy_(each.new_tensor(now).view_as(each))
 
     def log(self) -> dict[str, Any]:
-        """Returns counts of levels by bin, the bounds, and the mean width between them."""
+        """Returns counts of levels by bin, the bounds, and their mean width."""
         if not bool(self._counts.any()):
             return {}
         widths = self.bounds.diff(dim=-1).squeeze(-1)[self._points.free]
@@ -121,7 +121,7 @@ class BoundsCurriculum(CountingCurriculum):
         }
 
     def _draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """Draws points [n, D]; returns the bounds [n] that they lie on, and their places."""
+        """Draws points [n, D], and returns which bound [n] each lies on and where that bound is."""
         bounds = self.bounds
         shares = torch.rand(count, len(bounds), generator=generator, dtype=torch.float64)
         points = bounds[:, 0].lerp(bounds[:, 1], shares)
@@ -133,7 +133,7 @@ class BoundsCurriculum(CountingCurriculum):
         return points, which.where(on_bound, INSIDE), places
 
     def _moved(self, which: int, place: float, mean: float) -> float:
-        """Returns where a bound is after levels on it came to this in the mean."""
+        """Returns the new place of a bound, given the mean result of the levels on it."""
         axis, side = divmod(which, 2)
         outwards = self._step if side else -self._step
         move = outwards if mean >= self._upper else -outwards * (mean <= self._lower)

@@ -1,4 +1,4 @@
-"""A buffer of N levels, and functions that change it.
+"""A buffer of N scored levels, and the functions that draw from it and change it.
 
 Prioritised level replay (Jiang et al. 2021, arXiv 2010.03934, section 3) keeps levels with a score
 of how much there is to learn on them, and draws them again from
@@ -55,7 +55,7 @@ ONE_BY_ONE = 128
 
 @settings
 class ReplayRule:
-    """The rule by which levels are drawn from a buffer.
+    """Says how levels are drawn from a buffer.
 
     Attributes:
         prioritization: what the score weights depend on. ``rank``: r^(-1/T) of the r-th best score;
@@ -73,7 +73,7 @@ class ReplayRule:
 
 
 def empty_buffer(level: Any, capacity: int) -> TensorDict:
-    """Returns an empty buffer [capacity] for levels of the kind of the given one, []."""
+    """Makes an empty buffer [capacity] for levels like the given one, []."""
     shape = (capacity,)
     numbers = ("touched", "clock", "key", "parent", "generation", "draws")
     return TensorDict(
@@ -90,7 +90,7 @@ def empty_buffer(level: Any, capacity: int) -> TensorDict:
 
 
 def score_weights(score: Tensor, filled: Tensor, rule: ReplayRule) -> Tensor:
-    """Returns the shares of the levels by their scores; they add up to 1 where there is any level.
+    """Returns the shares of the levels by their scores; the sum is 1 unless all slots are empty.
 
     Args:
         score: float [*B, N].
@@ -112,7 +112,7 @@ def score_weights(score: Tensor, filled: Tensor, rule: ReplayRule) -> Tensor:
 
 
 def shares_by_rank(falling: Tensor, count: Tensor, rule: ReplayRule) -> Tensor:
-    """Returns the shares of the best score, the second best and so on: float64 [*B, N].
+    """Returns the shares of scores in falling order: float64 [*B, N].
 
     Args:
         falling: the scores, float64 [*B, N].
@@ -139,12 +139,12 @@ def shares_by_rank(falling: Tensor, count: Tensor, rule: ReplayRule) -> Tensor:
 
 @lru_cache(8)
 def _by_rank(count: int, temperature: float) -> Tensor:
-    """Returns r^(-1/T) of ranks r = 1 to ``count``, float64, which nobody may change."""
+    """Returns r^(-1/T) of the ranks r = 1 to ``count``, float64. Shared: do not change it."""
     return torch.arange(1, count + 1).double() ** (-1 / temperature)
 
 
 def replay_weights(score: Tensor, age: Tensor, filled: Tensor, rule: ReplayRule) -> Tensor:
-    """Returns the probability of each slot to be drawn: float64 [*B, N], zero for empty slots.
+    """Returns the probability that each slot is drawn, 0 for empty slots: float64 [*B, N].
 
     Args:
         score: float [*B, N].
@@ -163,7 +163,7 @@ def draw_slots(
     rule: ReplayRule,
     generator: torch.Generator,
 ) -> Tensor:
-    """Draws levels one after another: each draw advances the clock and makes its level fresh.
+    """Draws levels one after another; each draw advances the clock and resets the age of its level.
 
     Args:
         buffer: with a level in some slot.
@@ -183,7 +183,7 @@ def draw_slots(
 
 
 def insert(buffer: TensorDictBase, new: TensorDictBase, rule: ReplayRule) -> None:
-    """Inserts levels that were scored, one after another.
+    """Inserts scored levels one after another.
 
     A level that is there already gets its new score. Another one gets the next free slot; where
     there is none, that of the level that is least likely to be drawn, if its score is higher than
@@ -231,7 +231,7 @@ def rescore(
     best: Tensor,
     reached: Tensor | None = None,
 ) -> None:
-    """Replaces the scores of levels that were drawn by new ones.
+    """Replaces the scores of levels that were drawn.
 
     Args:
         buffer: [N].
@@ -249,7 +249,7 @@ def rescore(
 
 
 def lineage(buffer: TensorDictBase, most: int) -> Tensor:
-    """Returns the slots of the longest line of levels, each edited from the one before: int64 [m].
+    """Returns the slots of the longest chain of edits, from ancestor to descendant: int64 [m].
 
     Args:
         buffer: [N].
@@ -268,7 +268,7 @@ def lineage(buffer: TensorDictBase, most: int) -> Tensor:
 
 
 def _mean_of_slots(old: Tensor, slots: Tensor, new: Tensor) -> Tensor:
-    """Returns for each slot the mean of what is new and finite in it, or its old value: [*B, N].
+    """Returns the mean of the finite new values of each slot, or else its old value: [*B, N].
 
     Args:
         old: values of all slots, [*B, N].
@@ -288,7 +288,7 @@ def _numbers(entries: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _of_equals(key: Tensor, score: Tensor, best: Tensor) -> tuple[Tensor, Tensor]:
-    """Gives equal levels one score, the mean of the finite ones, and one highest return: [M]."""
+    """Gives equal levels the mean of their finite scores, and their highest return: [M]."""
     groups, group = key.unique(return_inverse=True)
     unknown = torch.full((len(groups),), torch.nan, dtype=torch.float64)
     mean = _mean_of_slots(unknown, group, score)
@@ -303,7 +303,7 @@ def _shares(weight: Tensor) -> Tensor:
 def draw_row(
     numbers: Numbers, by_score: Floats, staleness: float, noise: Floats
 ) -> NDArray[np.int64]:
-    """Draws slots one after another; each draw advances the clock and makes its level fresh.
+    """Draws slots one after another; each draw advances the clock and resets the age of its level.
 
     Args:
         numbers: of a row with a level.
@@ -338,7 +338,7 @@ def draw_row(
 
 
 class Ranks:
-    """The slots by falling score, of equal scores the earlier slot first, and their shares.
+    """Keeps the slots in order of falling score, with their shares; ties go to the earlier slot.
 
     Args:
         score: of all slots, [N], which :meth:`change` changes.
@@ -356,7 +356,7 @@ class Ranks:
         self.shares[self._slots] = self._table
 
     def change(self, slot: int, score: float) -> None:
-        """Gives a slot another score, and renews the shares."""
+        """Changes the score of a slot and renews the shares."""
         old = self._place(slot, self._score[slot])
         new = self._place(slot, score)
         new -= new > old  # its own place does not count
@@ -376,7 +376,7 @@ class Ranks:
         self._uniform = uniform
 
     def _place(self, slot: int, score: float) -> int:
-        """Returns how many slots are before one with this score."""
+        """Returns how many slots rank before a slot with this score."""
         first = int(self._falling.searchsorted(-score, "left"))
         last = int(self._falling.searchsorted(-score, "right"))
         return first + int(self._slots[first:last].searchsorted(slot))
@@ -385,7 +385,7 @@ class Ranks:
 def insert_row(
     numbers: Numbers, keys: Places, scores: Floats, staleness: float, weigh: Weigh, by_rank: bool
 ) -> tuple[Places, Places]:
-    """Inserts levels into the slots of a row, one after another or many of them at once.
+    """Inserts levels into slots, one after another, or all at once if there are many.
 
     Changes ``filled``, ``key``, ``score``, ``touched`` and ``clock``.
 
@@ -469,5 +469,5 @@ def _insert_at_once(
 
 
 def _by_both(by_score: Floats, age: Places, staleness: float) -> Floats:
-    """Returns the shares that slots are drawn by, where there is a level in each: [N]."""
+    """Returns the shares by score and age of slots that all hold a level: [N]."""
     return by_score * (1 - staleness) + age * (staleness / max(int(age.sum()), 1))

@@ -1,4 +1,4 @@
-"""Curricula that are made of other curricula: filtered ones, one after another, several at once."""
+"""Curricula made of other curricula: filtered, one after another, or several at once."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from proposer_rl.streams import Streams
 
 
 class Combinator(LearnedCurriculum):
-    """The base of curricula that are made of others, to which it passes everything on.
+    """Passes every call on to the curricula that it is made of; the base of those below.
 
     Args:
         parts: the curricula.
@@ -35,16 +35,16 @@ class Combinator(LearnedCurriculum):
         self.trains_replicas = any(part.trains_replicas for part in self._learned())
 
     def improve(self, student: Student, rng: Streams) -> dict[str, Any]:
-        """Improves the parts that train something."""
+        """Improves the parts that learn."""
         improved = [part.improve(student, rng) for part in self._learned()]
         return {key: value for metrics in improved for key, value in metrics.items()}
 
     def log(self) -> dict[str, Any]:
-        """Returns the logs of the parts in one; of entries that several have, the last one's."""
+        """Merges the logs of the parts; where several have an entry, the last part wins."""
         return {key: value for part in self.parts for key, value in part.log().items()}
 
     def learnt(self) -> dict[str, Any]:
-        """Returns what the last part has learnt that has learnt something."""
+        """Returns what the last part that learns has learnt."""
         return next(filter(None, (part.learnt() for part in reversed(self.parts))), {})
 
     def state_dict(self) -> dict[str, Any]:
@@ -52,7 +52,7 @@ class Combinator(LearnedCurriculum):
         return {**super().state_dict(), "parts": [part.state_dict() for part in self.parts]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned."""
         super().load_state_dict(state)
         for part, own in zip(self.parts, state["parts"], strict=True):
             part.load_state_dict(own)
@@ -67,7 +67,7 @@ class Combinator(LearnedCurriculum):
 
 
 class Filtered(Combinator):
-    """Draws several times as many levels from a curriculum, and keeps some by their scores.
+    """Draws several times as many levels as needed from a curriculum, and keeps some by score.
 
     The n levels that are kept are drawn one after another, none of them twice, each in proportion
     to
@@ -116,11 +116,11 @@ class Filtered(Combinator):
         rollouts: Count = 8,
         **settings: Any,
     ) -> Filtered:
-        """Makes it with a scorer of these settings: see :class:`Scorer`."""
+        """Makes it for a run, with a scorer of these settings; see :class:`Scorer`."""
         return cls(curriculum, Scorer(score, source, rollouts), **settings)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Draws a larger batch from the curriculum, and returns the levels of it that are kept."""
+        """Draws candidates from the curriculum, and returns the levels [n] that are kept."""
         candidates = proposed(self.parts[0], student, self._times * count, rng)
         scored = self._scorer(student, candidates.levels, rng, "choice")
         draw = rng.generator("choice")
@@ -128,7 +128,7 @@ class Filtered(Combinator):
         return Batch(kept.levels, kept.notes)
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Passes the outcome on to the curriculum that is filtered."""
+        """Passes the outcome on to the filtered curriculum."""
         self.parts[0].observe(student, batch, outcome)
 
 
@@ -159,7 +159,7 @@ class Schedule(Combinator):
         self._proposed = 0
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Returns what the present stage proposes."""
+        """Returns what the current stage proposes."""
         stage = self._stage
         batch = proposed(self.parts[stage], student, count, rng)
         self._proposed += 1
@@ -167,13 +167,13 @@ class Schedule(Combinator):
         return Batch(batch.levels, TensorDict(notes, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Passes the outcome on to the stage that has proposed the levels."""
+        """Passes the outcome on to the stage that proposed the levels."""
         if len(batch):
             own = Batch(batch.levels, batch.notes["notes"], batch.size)
             self.parts[int(batch.notes["stage"][0])].observe(student, own, outcome)
 
     def improve(self, student: Student, rng: Streams) -> dict[str, Any]:
-        """Improves the stage that the cycle begins with."""
+        """Improves the stage that is current when the cycle begins."""
         part = self.parts[self._stage]
         return part.improve(student, rng) if isinstance(part, LearnedCurriculum) else {}
 
@@ -183,7 +183,7 @@ class Schedule(Combinator):
 
 
 class Mixed(Combinator):
-    """Makes batches of which every curriculum has its share.
+    """Fills each batch with a fixed share of levels from every curriculum.
 
     Args:
         curricula: of one kind of levels.
@@ -224,7 +224,7 @@ class Mixed(Combinator):
         return Batch(levels, TensorDict({"part": whose, "size": sizes, **notes}, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Gives every curriculum the outcome of what it has proposed."""
+        """Passes the outcome of each level on to the curriculum that proposed it."""
         whose, sizes = batch.notes["part"], batch.notes["size"]
         for i in whose.unique().tolist():
             own = (whose == i).nonzero().flatten()
@@ -232,7 +232,7 @@ class Mixed(Combinator):
             self.parts[i].observe(student, part, outcome[own])
 
     def log(self) -> dict[str, Any]:
-        """Returns the log of each curriculum, whose entries begin with its number."""
+        """Returns the logs of the parts, with the number of the part before each entry."""
         record: dict[str, Any] = {}
         levels: dict[str, Any] = {}
         for i, part in enumerate(self.parts):
@@ -248,7 +248,7 @@ def _mixes(curriculum: Curriculum) -> bool:
 
 
 def draw_without_replacement(logits: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Draws places one after another, in proportion to exp(logit) of those that are left.
+    """Draws places without replacement, each in proportion to exp(logit) of those left.
 
     The largest of the logits with Gumbel noise are such draws (Kool et al. 2019, arXiv 1903.06059).
 

@@ -1,4 +1,4 @@
-"""The contract of a curriculum: all that its author reads.
+"""What you need to write a curriculum: the base class and its batches.
 
 A curriculum proposes levels to a student and observes how the student fared on them:
 
@@ -36,7 +36,7 @@ from proposer_rl.task import Levels
 
 @dataclass(frozen=True)
 class Batch:
-    """Levels that a curriculum has proposed, or a part of them, ``batch[some]``.
+    """Levels that a curriculum proposed, with notes about them; ``batch[some]`` is a part.
 
     Attributes:
         levels: [n], on the device of the task.
@@ -72,7 +72,7 @@ class Batch:
 
 
 def outcome_of(rollout: TensorDictBase) -> TensorDict:
-    """Returns the outcome of levels, from TorchRL's rollout [n, T] on them.
+    """Computes the outcome of levels from a TorchRL rollout [n, T] on them.
 
     Every outcome is a tensordict [n] with
 
@@ -102,7 +102,7 @@ def outcome_of(rollout: TensorDictBase) -> TensorDict:
 
 
 def outcome_of_episodes(episodes: Sequence[TensorDictBase]) -> TensorDict:
-    """Returns the outcome of levels [m] by the one episode [T] that was played on each.
+    """Computes the outcome of levels [m] from one episode [T] on each.
 
     Shorter episodes are filled up with zeros to one rollout [m, T]; their entry ``is_step`` says
     which steps were played.
@@ -116,7 +116,7 @@ def outcome_of_episodes(episodes: Sequence[TensorDictBase]) -> TensorDict:
 
 
 class Curriculum:
-    """The interface of curricula; of its methods only :meth:`propose` must be defined.
+    """The base class of curricula; only :meth:`propose` must be defined.
 
     Attributes:
         needs: names of what it asks of a student; see :class:`~proposer_rl.curricula.Student`.
@@ -133,7 +133,7 @@ class Curriculum:
 
     @classmethod
     def create(cls, run: Components, **settings: Any) -> Curriculum:
-        """Makes it for a run, as commands and :class:`~proposer_rl.Teacher` do.
+        """Makes the curriculum for a run; the command line, ``train`` and ``Teacher`` call it.
 
         This one passes on the space of the task's levels. Override it to take something else of
         the run: ``return cls(run.task.target, **settings)``.
@@ -148,7 +148,7 @@ class Curriculum:
         return made
 
     def propose(self, student: Student, count: int, rng: Streams) -> Levels | Batch:
-        """Returns levels [n] for the student to train on next, with notes where it needs any.
+        """Returns levels [n] for the student to train on next, with or without notes.
 
         Args:
             student: as it is.
@@ -158,7 +158,7 @@ class Curriculum:
         raise TypeError(f"{type(self).__name__} must define propose(student, count, rng)")
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Learns from the outcome of a batch or of a part of one.
+        """Learns from the outcome of a batch, or of a part of it.
 
         Args:
             student: after it has trained on the levels, or while it does.
@@ -174,17 +174,17 @@ class Curriculum:
         return {}
 
     def learnt(self) -> dict[str, Any]:
-        """Returns the part of the state that runs on other students can begin with, or nothing."""
+        """Returns the part of the state that other runs can start from; empty for none."""
         return {}
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that a resumed run needs, in nested dicts of tensors, numbers and strings."""
+        """Returns all that a resumed run needs, as nested dicts of tensors, numbers and strings."""
         kind: Any = type(self)
         _warn_of_nothing(kind)
         return {name.strip("_"): saved(getattr(self, name)) for name in self.state}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned.
+        """Restores what :meth:`state_dict` returned.
 
         Raises:
             ArgumentError: if that was the state of another class.
@@ -199,11 +199,11 @@ class Curriculum:
             setattr(self, name, restored(state[name.strip("_")], getattr(self, name)))
 
     def close(self) -> None:
-        """Releases what is held outside of this process."""
+        """Releases resources outside of this process."""
 
 
 class LearnedCurriculum(Curriculum):
-    """A curriculum that trains something before a cycle, such as a Proposer or one of its parts.
+    """The base class of curricula that train something of their own, such as a Proposer.
 
     Attributes:
         trains_replicas: whether it trains replicas of the student, which other processes can do.
@@ -212,7 +212,7 @@ class LearnedCurriculum(Curriculum):
     trains_replicas: bool = False
 
     def improve(self, student: Student, rng: Streams) -> dict[str, Any]:
-        """Prepares for the next cycle, and returns metrics of it as :meth:`Curriculum.log` does.
+        """Trains before a cycle, and returns metrics as :meth:`Curriculum.log` does.
 
         If it raises, :meth:`Curriculum.load_state_dict` and another call may follow.
 
@@ -224,7 +224,7 @@ class LearnedCurriculum(Curriculum):
 
 
 def proposed(curriculum: Curriculum, student: Student, count: int, rng: Streams) -> Batch:
-    """Lets a curriculum propose, and returns its levels as a batch, with or without notes.
+    """Lets a curriculum propose, and returns its levels as a batch.
 
     Raises:
         ArgumentError: if they are not ``count`` levels.
@@ -241,7 +241,7 @@ def proposed(curriculum: Curriculum, student: Student, count: int, rng: Streams)
 
 @functools.cache
 def _warn_of_nothing(kind: type[Curriculum]) -> None:
-    """Warns, once, of a class that observes and does not say what of that is to be saved."""
+    """Warns once about a class that observes but does not name the state to save."""
     said = kind.state_dict is not Curriculum.state_dict or any(
         "state" in vars(parent) for parent in kind.__mro__ if parent is not Curriculum
     )

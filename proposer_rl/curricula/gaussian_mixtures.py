@@ -1,4 +1,4 @@
-"""ALP-GMM: levels from where a mixture of Gaussians has seen absolute learning progress."""
+"""ALP-GMM: draws levels where a mixture of Gaussians has seen absolute learning progress."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TwoOrMore = Annotated[int, Interval(ge=2, le=1_000_000)]
 
 
 class MixtureCurriculum(CountingCurriculum):
-    """Draws levels as points of a box, and rounds them to the space's bins.
+    """Draws levels as points of a box, from Gaussians fitted to recent learning progress.
 
     A point of the box [-1, 1]^D that the space's coordinates span is rounded to a bin, whose
     coordinates x are the task. The progress of an episode on x with return r is |r - r'|, with r'
@@ -95,7 +95,7 @@ class MixtureCurriculum(CountingCurriculum):
         self._drawn = torch.zeros(2, dtype=torch.int64)  # from mixtures, and clipped of these
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Draws points, and returns levels [n] of the bins nearest to them."""
+        """Draws points, and returns the levels [n] of the nearest bins."""
         self._fit(rng)
         points = self._draw(count, rng.generator("choices"))
         levels, bins = self._points.levels(points, rng)
@@ -137,7 +137,7 @@ class MixtureCurriculum(CountingCurriculum):
         }
 
     def _fit(self, rng: Streams) -> None:
-        """Fits a new mixture if it is time."""
+        """Fits a new mixture if one is due."""
         episodes = len(self._history["returns"]) if self._history else 0
         due = episodes // self._refit > self._fitted // self._refit
         if episodes < self._warmup or not due:
@@ -164,7 +164,7 @@ class MixtureCurriculum(CountingCurriculum):
 
 
 def fit_mixture(points: Tensor, most: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Fits mixtures of 2 to ``most`` Gaussians, and returns the one with the least AIC.
+    """Fits mixtures of 2 to ``most`` Gaussians, and returns the one with the lowest AIC.
 
     Full covariances, expectation maximisation from one start by k-means
     (Portelas et al. 2019, arXiv 1910.07224, algorithm 1).
@@ -225,7 +225,7 @@ def draw_points(
 def absolute_progress(
     tasks: Tensor, returns: Tensor, new_tasks: Tensor, new_returns: Tensor
 ) -> Tensor:
-    """Returns |r - r'| of new episodes, with r' the return on the nearest of earlier tasks.
+    """Returns |r - r'| of new episodes, where r' is the return on the nearest earlier task.
 
     Portelas et al. 2019 (arXiv 1910.07224), equation of the absolute learning progress. As in their
     code, it is 0 as long as no more than five are stored.

@@ -1,4 +1,4 @@
-"""CurrOT on the bins: a distribution that moves to the target through what is mastered."""
+"""CurrOT on the bins: moves the distribution of levels to the target through mastered bins."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class TransportCurriculum(BinCurriculum):
 
     @classmethod
     def create(cls, run: Components, **settings: Any) -> TransportCurriculum:
-        """Makes it for a run's space and the shares of its bins in the target."""
+        """Makes it for a run's space and the target's shares of its bins."""
         return cls(run.task.space, run.task.target_shares, **settings)
 
     def score(self, student: Student, count: int, rng: Streams) -> None:
@@ -116,7 +116,7 @@ class TransportCurriculum(BinCurriculum):
         return (1 - part) * share + part / len(share)
 
     def log(self) -> dict[str, Any]:
-        """Returns also how many bins are allowed, and the distance W2 to the target."""
+        """Adds the number of allowed bins and the distance W2 to the target."""
         record = super().log()
         if record:
             record["allowed_bins"] = int(self.scores["allowed"].sum())
@@ -127,7 +127,7 @@ class TransportCurriculum(BinCurriculum):
 def step_towards(
     target: Floats, now: Floats, costs: Floats, allowed: Mask, reach: float
 ) -> tuple[Floats, float]:
-    """Returns the distribution on allowed bins, near the present one, that is nearest the target.
+    """Returns the distribution nearest to the target that is on allowed bins and within reach.
 
     The minimum of W2(p, target) over distributions p with W2(p, now) <= reach and p = 0 where not
     allowed (Klink et al. 2022, "Curriculum Reinforcement Learning via Constrained Optimal

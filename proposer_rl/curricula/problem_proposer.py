@@ -1,4 +1,4 @@
-"""The paper's Proposer, rewarded for each problem by itself: by first-order gain or by regret."""
+"""The paper's Proposer with a reward for every problem: first-order gain or regret."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from proposer_rl.task import Distribution, Levels, Space, Task, refuse_unfit_bin
 
 
 class ProblemProposer(CountingCurriculum):
-    """Draws each of P problems from a policy, and trains it by the reward of each.
+    """Draws each of P problems from a policy, and trains the policy by the reward of each.
 
     At every proposal the policy sees what the student would do on probe levels of the target, draws
     the bin of each problem, and is rewarded for each, standardised over all that it drew. A few
@@ -82,10 +82,10 @@ class ProblemProposer(CountingCurriculum):
     def reward(
         self, student: Student, levels: Levels, rng: Streams
     ) -> tuple[Tensor, dict[str, float]]:
-        """Returns the rewards of levels [E], float [E], and metrics."""
+        """Computes the rewards of levels [E], float [E], and metrics."""
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Draws levels [n] from the policy, which learns from them at once.
+        """Draws levels [n] from the policy, and trains it on them at once.
 
         The policy draws P at a time, and learns from all that it drew.
 
@@ -115,22 +115,22 @@ class ProblemProposer(CountingCurriculum):
         return Batch(levels[:count], TensorDict({"bins": bins[:count]}, [count]))
 
     def log(self) -> dict[str, Any]:
-        """Returns the last metrics of the policy, and how many levels of each bin came back."""
+        """Returns the last metrics of the policy, and counts of observed levels by bin."""
         if not self._metrics:
             return {}
         return {**self._metrics, "histogram": self.histogram()}
 
     def learnt(self) -> dict[str, Any]:
-        """Returns the Proposer, without its optimiser."""
+        """Returns the Proposer without its optimiser."""
         return learnt_proposer(self.agent)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns also the Proposer and Adam's state."""
+        """Adds the Proposer and Adam's state."""
         own = learnt_proposer(self.agent) | {"adam": deepcopy(self._adam.state_dict())}
         return super().state_dict() | own
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned."""
         super().load_state_dict(state)
         load_agent(self.agent, TensorDict(state["proposer"]))
         self._adam.load_state_dict(deepcopy(state["adam"]))
@@ -157,7 +157,7 @@ class ProblemProposer(CountingCurriculum):
 
 
 class FirstOrderProposer(ProblemProposer):
-    """Rewards each problem with its alignment, its first-order share of the target's gain.
+    """Rewards each problem with its alignment: its share of the target's first-order gain.
 
     The alignment of a level is the slope of its return along the direction of the parameters that
     raises the target's performance fastest (:mod:`proposer_rl.meta.first_order`).
@@ -191,7 +191,7 @@ class FirstOrderProposer(ProblemProposer):
     def reward(
         self, student: Student, levels: Levels, rng: Streams
     ) -> tuple[Tensor, dict[str, float]]:
-        """Returns the alignment of each level, by evaluations on either side of the student."""
+        """Computes the alignment of each level from evaluations on either side of the student."""
         target = self.target.sample(self._target_levels, rng.generator("target"))
         reached, direction = student.target_direction(target, self._measure)
         aligned = student.alignment(direction, levels, self._step)
@@ -242,7 +242,7 @@ class PairedProposer(ProblemProposer):
         self._seeds: list[int] = []
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Draws levels [n] from the policy, which learns from them at once."""
+        """Draws levels [n] from the policy, and trains it on them at once."""
         batch = super().propose(student, count, rng)
         seed = rng.generator("antagonist").initial_seed()  # of its actions on these levels
         batch.notes["seed"] = torch.full((count,), seed)
@@ -251,7 +251,7 @@ class PairedProposer(ProblemProposer):
     def reward(
         self, student: Student, levels: Levels, rng: Streams
     ) -> tuple[Tensor, dict[str, float]]:
-        """Returns the regret of each level."""
+        """Computes the regret on each level."""
         antagonist, protagonist = (
             each.performance(levels, rng.generator("regret"))["return"]
             for each in (self.antagonist, student)
@@ -264,7 +264,7 @@ class PairedProposer(ProblemProposer):
         }
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Lets the antagonist take as many steps on the levels.
+        """Trains the antagonist on the levels that the student has trained on.
 
         Raises:
             DivergedError: if a number of the antagonist is not finite.
@@ -283,10 +283,10 @@ class PairedProposer(ProblemProposer):
             self._learner.check()
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns also the antagonist."""
+        """Adds the antagonist."""
         return super().state_dict() | {"antagonist": self._learner.snapshot().to_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned."""
         super().load_state_dict(state)
         self._learner.restore(TensorDict(state["antagonist"], [1]))

@@ -1,4 +1,4 @@
-"""Curricula that keep levels and train on them again: PLR, robust PLR, ACCEL and their relatives.
+"""Curricula that replay levels from a buffer: PLR, robust PLR, ACCEL, NCC and TRACED.
 
 One loop with options, which is what the methods differ in:
 
@@ -61,7 +61,7 @@ SHOWN = 6  # levels of each kind that a reader is shown
 
 
 class ReplayCurriculum(Curriculum):
-    """Draws batches from a buffer of levels by their scores.
+    """Replays levels from a buffer by their scores, and adds new or edited ones.
 
     Args:
         space: where levels come from that are not edited.
@@ -166,7 +166,7 @@ class ReplayCurriculum(Curriculum):
         staleness: Share = ReplayRule.staleness,
         **settings: Any,
     ) -> ReplayCurriculum:
-        """Makes it for a run's space and edits: see :class:`Scorer` and :class:`ReplayRule`."""
+        """Makes it for a run's space and edits; see :class:`Scorer` and :class:`ReplayRule`."""
         rule = ReplayRule(
             prioritization=prioritization, temperature=temperature, best=best, staleness=staleness
         )
@@ -174,7 +174,7 @@ class ReplayCurriculum(Curriculum):
         return cls(run.task.space, scorer, rule, run.optional("edit"), **settings)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Returns levels [n], replayed or new."""
+        """Returns levels [n], all of them replayed or all of them new."""
         self._finish(student, rng)
         slots = torch.zeros(count, dtype=torch.int64)
         if replayed := self._explore(student, count, rng):
@@ -199,7 +199,7 @@ class ReplayCurriculum(Curriculum):
         return Batch(moved(levels, self._device), TensorDict(notes, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Scores the levels by the episodes on them, where these are what scores are made of."""
+        """Scores the levels, if scores come from episodes."""
         notes = dict(batch.notes.items())
         evidence = {"level": moved(batch.levels, CPU)}
         evidence |= {name: notes[name] for name in ("slot", "replayed", "key")}
@@ -215,7 +215,7 @@ class ReplayCurriculum(Curriculum):
             self._due.append(TensorDict(evidence, [len(batch)]))
 
     def log(self) -> dict[str, Any]:
-        """Returns how much was replayed, and statistics of the buffer."""
+        """Returns the share of replayed levels, and statistics of the buffer."""
         buffer, filled = self.buffer, self.buffer["filled"]
         if not bool(filled.any()):
             return {}
@@ -236,17 +236,17 @@ class ReplayCurriculum(Curriculum):
         return record
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns also what is due for the levels that were trained on."""
+        """Adds the levels whose exact scores or children are due."""
         return super().state_dict() | {"due": [packed(evidence) for evidence in self._due]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned."""
         super().load_state_dict(state)
         like = self.buffer.select("level")
         self._due = [unpacked(evidence, like) for evidence in state["due"]]
 
     def _finish(self, student: Student, rng: Streams) -> None:
-        """Scores exactly the levels that were trained on, and makes and scores their children."""
+        """Computes the exact scores, and the children, of levels that were trained on."""
         due, self._due = self._due, []
         for i, evidence in enumerate(due):
             which = (i,) if i else ()
@@ -263,7 +263,7 @@ class ReplayCurriculum(Curriculum):
     def _children(
         self, evidence: TensorDictBase, draw: torch.Generator
     ) -> tuple[Levels, dict[str, Tensor]]:
-        """Returns children [m] of levels that were trained on, and where they come from."""
+        """Edits levels that were trained on; returns the children [m] and their origin."""
         assert self._edit is not None  # or there are no edits
         some = parents_among(evidence)
         parents, slots = evidence["level"][some], evidence["slot"][some]
@@ -271,7 +271,7 @@ class ReplayCurriculum(Curriculum):
         return self._edit(parents.unsqueeze(0), self._edits, [draw])[0], origin
 
     def _explore(self, student: Student, count: int, rng: Streams) -> bool:
-        """Scores new levels as long as it takes; returns whether the next batch is replayed."""
+        """Scores as many new levels as are needed; returns whether to replay the next batch."""
         batches = 0
         while True:
             chance = torch.rand((), generator=rng.generator("replay", batches))
@@ -304,18 +304,18 @@ class ReplayCurriculum(Curriculum):
         *purpose: str | int,
         reached: Tensor | None = None,
     ) -> Scored:
-        """Scores levels [m] that nobody trains on; ``reached`` as in :meth:`_expected`."""
+        """Scores levels [m] that are not trained on; for ``reached`` see :meth:`_expected`."""
         before = self._expected(unseen(len(levels)) if reached is None else reached)
         return self.scorer(student, moved(levels, self._device), rng, *purpose, before=before)
 
     def _expected(self, reached: Tensor) -> Tensor:
-        """Returns what was ``reached`` [m], or if unknown the mean over the buffer."""
+        """Fills unknown entries of ``reached`` [m] with the mean over the buffer."""
         known = self.buffer["reached"]
         mean = known.where(known.isfinite(), torch.nan).nanmean()
         return reached.where(reached.isfinite(), mean.nan_to_num(-torch.inf))
 
     def _score_all(self, student: Student, rng: Streams) -> None:
-        """Renews all scores."""
+        """Scores all levels of the buffer anew."""
         filled, place = self.buffer["filled"], torch.arange(self._capacity)
         # An empty slot holds no level that could be played: the first one stands in for it.
         slots = place.where(filled, 0)
@@ -323,7 +323,7 @@ class ReplayCurriculum(Curriculum):
         rescore(self.buffer, slots, *self._score(student, levels, rng, "all", reached=reached))
 
     def _take(self, evidence: Mapping[str, Any], scored: Scored, reached: Tensor) -> None:
-        """Takes the scores of levels that were trained on; new levels go into the buffer.
+        """Stores the scores of levels that were trained on; new levels enter the buffer.
 
         Args:
             evidence: of the levels [m].
@@ -342,7 +342,7 @@ class ReplayCurriculum(Curriculum):
             self._credit(before, slots)
 
     def _credit(self, score: Tensor, slots: Tensor) -> None:
-        """Credits the levels trained on before with how far the scores [m] in these slots fell."""
+        """Raises the scores of the previous batch by how much the scores [m] of this one fell."""
         fell = (score - self.buffer["score"][slots]).mean()
         if before := self._before:
             there = self.buffer["key"][before["slot"]] == before["key"]  # not evicted since
@@ -355,7 +355,7 @@ class ReplayCurriculum(Curriculum):
         return moved(self._new_levels.sample(count, rng.generator(*purpose)), CPU)
 
     def _shown(self) -> dict[str, Levels]:
-        """Returns levels of the buffer for reports, by their captions."""
+        """Returns levels of the buffer to show in reports, by caption."""
         buffer = self.buffer[self.buffer["filled"]]
         shown = {
             "highest scores": buffer["score"].topk(min(SHOWN, len(buffer))).indices,
@@ -380,7 +380,7 @@ def parents_among(evidence: TensorDictBase) -> Tensor:
 
 
 def easiness(student: Student, outcome: TensorDictBase) -> Tensor:
-    """Returns mean absolute advantage minus mean return, highest for "easy" parents: [n].
+    """Returns mean absolute advantage minus mean return [n]; "easy" parents have the highest.
 
     The authors' code (dcd) takes the levels with the lowest return minus value loss.
     """

@@ -1,4 +1,4 @@
-"""Scores levels by how much there is to learn there, from episodes or from a student itself.
+"""Scores levels by how much a student can learn there, from episodes or by evaluation.
 
 A score from episodes reads a rollout [n, T], of which only episodes count that end in it: it is
 the mean over the steps of each, then the mean over the episodes of a level; minus infinity where
@@ -111,7 +111,7 @@ EXACT: dict[str, tuple[tuple[str, ...], Callable[[Student, Levels], Tensor]]] = 
 
 
 class Episodes(NamedTuple):
-    """The episodes of a rollout [n, T] that end in it.
+    """The episodes that end within a rollout [n, T].
 
     Attributes:
         weight: of every step, float64 [n, T]: 1 / (steps of its episode), so that those of an
@@ -150,7 +150,7 @@ def episodes(rollout: TensorDictBase) -> Episodes:
 
 
 class Scored(NamedTuple):
-    """Levels' scores, and the highest returns ever seen there.
+    """Scores of levels, and the highest returns ever seen on them.
 
     Attributes:
         score: float64 [n].
@@ -162,12 +162,12 @@ class Scored(NamedTuple):
 
 
 def unseen(count: int) -> Tensor:
-    """Returns the highest return of levels [n] that nobody has played yet."""
+    """Returns the highest returns of levels [n] that nobody has played: minus infinity."""
     return torch.full((count,), -torch.inf)
 
 
 class Scorer:
-    """One of the scores, from one of its sources, or a function of one's own.
+    """Scores levels by one of the scores above, or by a function of your own.
 
     Args:
         score: its name, see the table above; or, from episodes, an :data:`OwnScore` or the dotted
@@ -283,7 +283,7 @@ class Scorer:
         *purpose: str | int,
         before: Tensor | None = None,
     ) -> Scored:
-        """Scores levels [n] that nobody trains on; the student counts the cost.
+        """Scores levels [n] without training on them; the student counts the cost.
 
         Args:
             student: that would be trained.
@@ -328,7 +328,7 @@ class Scorer:
         return self.of_outcome(student, outcome, best, before)
 
     def _look_at(self, answers: Tensor) -> None:
-        """Warns, once, if the yield is of groups of one answer, none of which can be mixed."""
+        """Warns once if the yield is taken of single answers, which are never mixed."""
         if self._name == "yield" and not self._warned and single(answers):
             self._warned = True
             warnings.warn(
@@ -338,7 +338,7 @@ class Scorer:
             )
 
     def _by_own(self, student: Student, outcome: TensorDictBase) -> Tensor:
-        """Returns one's own score of an outcome [n], float64."""
+        """Scores an outcome [n] by a function of your own: float64 [n]."""
         assert self._own is not None
         score, shape = self._own(student, outcome), outcome.batch_size
         if not isinstance(score, Tensor) or score.shape != shape or bool(score.isnan().any()):
@@ -348,7 +348,7 @@ class Scorer:
 
 
 def mixed(p: Tensor, answers: Tensor | float) -> Tensor:
-    """Returns the probability that not all answers to an item are alike.
+    """Returns the probability that the answers to an item are not all alike.
 
     Args:
         p: probability of a right one.
@@ -362,12 +362,12 @@ def mixed(p: Tensor, answers: Tensor | float) -> Tensor:
 
 
 def single(answers: Tensor) -> bool:
-    """Returns whether there are groups, numbers of answers, and none of them has several."""
+    """Returns whether there are groups of one answer, and none of several."""
     return bool((answers == 1).any()) and not bool((answers > 1).any())
 
 
 def _own_score(score: str | OwnScore) -> OwnScore | None:
-    """Returns the function that a score is or names with dots; None for one of the table."""
+    """Finds a function of your own, given or named with dots; None for a built-in score."""
     if not isinstance(score, str):
         return score
     if "." not in score:
@@ -380,7 +380,7 @@ def _own_score(score: str | OwnScore) -> OwnScore | None:
 
 
 def _of_returns(name: str, outcome: Mapping[str, Tensor], best: Tensor, before: Tensor) -> Scored:
-    """Returns a score of levels [n] from returns and success alone; see the module's text."""
+    """Scores levels [n] by returns and success alone; see the description above."""
     reached = outcome["return"].double()
     success = outcome.get("success", torch.zeros_like(reached)).double()
     value = before.double().where(before.isfinite(), reached)

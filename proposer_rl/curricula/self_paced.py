@@ -1,4 +1,4 @@
-"""Self-paced learning: a Gaussian over the space that moves to the target as performance allows."""
+"""Self-paced learning (SPDL): a Gaussian moves to the target as fast as performance allows."""
 
 from __future__ import annotations
 
@@ -103,12 +103,12 @@ class SelfPacedCurriculum(CountingCurriculum):
 
     @classmethod
     def create(cls, run: Components, **settings: Any) -> SelfPacedCurriculum:
-        """Makes it for a run's space, its target and the shares of the bins in that."""
+        """Makes it for a run's space, its target and the target's shares of the bins."""
         task = run.task
         return cls(task.space, task.target, task.target_shares, **settings)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Draws points from the Gaussian, and returns levels [n] there."""
+        """Draws points from the Gaussian, and returns the levels [n] there."""
         shape = count, self._points.size
         shares = torch.rand(shape, generator=rng.generator("choices"), dtype=torch.float64)
         points, log_density = draw_in_box(self.mean, self.deviation, shares)
@@ -117,7 +117,7 @@ class SelfPacedCurriculum(CountingCurriculum):
         return Batch(levels, TensorDict(notes, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Adds episodes, and makes a step where there are enough."""
+        """Collects episodes, and moves the Gaussian when there are enough."""
         super().observe(student, batch, outcome)
         some = {name: batch.notes[name] for name in ("points", "log_density")}
         self._episodes.append({**some, "reached": outcome[self._measure].double().cpu()})
@@ -125,7 +125,7 @@ class SelfPacedCurriculum(CountingCurriculum):
             self._step()
 
     def log(self) -> dict[str, Any]:
-        """Returns counts of levels by bin, the Gaussian, and how far it is from the target."""
+        """Returns counts of levels by bin, the Gaussian, and its divergence from the target."""
         if not bool(self._counts.any()):
             return {}
         return {
@@ -166,7 +166,7 @@ class Gaussian(NamedTuple):
 
 
 def draw_in_box(mean: Tensor, deviation: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns points of the box [-1, 1]^D drawn from a Gaussian, and the logs of their densities.
+    """Draws points of the box [-1, 1]^D from a Gaussian; returns them and their log densities.
 
     Args:
         mean: within the box, float64 [D].
@@ -203,7 +203,7 @@ def divergence(one: Gaussian, other: Gaussian) -> tuple[float, Floats]:
 def expected_performance(
     one: Gaussian, points: Floats, log_density: Floats, reached: Floats
 ) -> tuple[float, Floats]:
-    """Returns the mean of what was reached, if points were drawn from a Gaussian, and its gradient.
+    """Estimates the mean performance under a Gaussian from episodes, and its gradient.
 
     Each episode has the weight of its density in the Gaussian over that with which it was drawn;
     weights are normalised.
@@ -236,7 +236,7 @@ def step_towards(
     epsilon: float,
     least: float,
 ) -> tuple[Gaussian, float]:
-    """Returns the Gaussian near the present one that is nearest to the target, and performs.
+    """Returns the Gaussian nearest to the target that is in reach and performs well enough.
 
     The minimum of KL(p, target) over Gaussians p with KL(p, now) <= epsilon and an expected
     performance of at least delta, by sequential quadratic programming (SciPy's SLSQP). Where none

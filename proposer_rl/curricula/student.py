@@ -1,4 +1,4 @@
-"""The functions that a curriculum may ask of the student that it proposes to.
+"""The functions of a student that a curriculum may ask for.
 
 Most curricula ask for nothing; others name what they need (:attr:`Curriculum.needs`), so that a
 loop of any kind gives that alone, and a student that lacks something is refused before a run
@@ -36,11 +36,11 @@ VALUE = "state_value"  # the critic's entry in a rollout
 
 
 class UnfitStudentError(TypeError):
-    """A student lacks what a curriculum needs; the message is a line that says what."""
+    """A student lacks what a curriculum needs; the message is one line that names it."""
 
 
 class Student:
-    """A student as a curriculum sees it, and a meter of what it asked of the student.
+    """A student as a curriculum sees it, with counters of what the curriculum asked for.
 
     What a student can do is a function: given to the constructor, or a method of a subclass. Levels
     are [n] for any n unless it says otherwise; results are without gradients. Asking for a function
@@ -115,12 +115,12 @@ class Student:
             setattr(self, name, function)
 
     def spend(self, *, frames: int = 0, evaluations: int = 0) -> None:
-        """Counts frames and evaluations that were spent on the curriculum's account."""
+        """Adds to the counters of frames and evaluations."""
         self.frames += frames
         self.evaluations += evaluations
 
     def lacks(self, name: str) -> str | None:
-        """Returns why the student lacks the function of that name; None if it has it."""
+        """Returns why the student lacks this function; None if the student has it."""
         if name in vars(self) or hasattr(type(self), name):
             return None
         _, *given = inspect.signature(getattr(TaskStudent, f"_{name}")).parameters
@@ -149,7 +149,7 @@ def require(student: Student, needs: Iterable[str], who: str) -> None:
 
 
 class TaskStudent(Student):
-    """One of the Solvers of a task that train by PPO, which can do all that the task allows.
+    """A Solver that trains by PPO on a task, and can do all that the task allows.
 
     Args:
         task: that evaluates it.
@@ -169,7 +169,7 @@ class TaskStudent(Student):
         self._learner = learner if learner.copies == 1 else learner.replica(replica)
 
     def lacks(self, name: str) -> str | None:
-        """Returns why the task does not allow the function of that name; None if it does."""
+        """Returns why the task does not allow this function; None if it does."""
         kinds: dict[str, tuple[type, str]] = {
             "optimal_return": (OptimalTask, "optimal_return(levels)"),
             **dict.fromkeys(
@@ -238,7 +238,7 @@ class TaskStudent(Student):
         return self._task.spectators(self._learner)
 
     def _filled_up(self, levels: Levels) -> Levels:
-        """Repeats the last of levels [n], so that there are as many as an environment [1, P] takes.
+        """Repeats the last of levels [n] until they fill an environment [1, P].
 
         Returns:
             [1, P].
@@ -253,7 +253,7 @@ class TaskStudent(Student):
 
 
 def advantages(student: Student, rollout: TensorDictBase, lmbda: float | None = None) -> Tensor:
-    """Returns generalised advantages A_t, not standardised: float64 [*B, n, T].
+    """Computes generalised advantages A_t, not standardised: float64 [*B, n, T].
 
     Args:
         student: whose discount and decay of traces are used.
@@ -270,7 +270,7 @@ def advantages(student: Student, rollout: TensorDictBase, lmbda: float | None = 
 
 
 def values(steps: TensorDictBase) -> Tensor:
-    """Returns what a critic has written of steps, float [*B, 1].
+    """Returns the critic's values of steps, float [*B, 1].
 
     Raises:
         ArgumentError: if it has not.

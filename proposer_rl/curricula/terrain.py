@@ -1,4 +1,4 @@
-"""Terrain levels: a row up after a success, a row down after a failure, anywhere after the last."""
+"""Terrain levels: one row up after a success, one down after a failure."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from proposer_rl.task import Space, refuse_many_bins
 
 
 class RowsCurriculum(CountingCurriculum):
-    """The rule of ``legged_gym`` for robots on terrains whose rows are harder and harder.
+    """Moves robots between rows of growing difficulty, by the rule of ``legged_gym``.
 
     A robot whose level in row r came to at least ``upper`` gets one in row r + 1 next, one whose
     level came to less than ``lower`` one in row r - 1, others stay; there is none below the first.
@@ -79,7 +79,7 @@ class RowsCurriculum(CountingCurriculum):
         self._queue = torch.zeros(0, dtype=torch.int64)  # rows [m] of the next levels
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Returns levels [n] in the rows that are next."""
+        """Returns levels [n] in the rows that are next in the queue."""
         next_rows, self._queue = self._queue[:count], self._queue[count:]
         uniform = partial(torch.randint, size=(count,), generator=rng.generator("choices"))
         first, anywhere = uniform(self._start + 1), uniform(self._rows)
@@ -91,14 +91,14 @@ class RowsCurriculum(CountingCurriculum):
         return Batch(levels, TensorDict({"bins": bins, "row": rows}, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Appends the rows that follow to those that are next."""
+        """Appends the next rows of the robots to the queue."""
         super().observe(student, batch, outcome)
         reached = outcome[self._measure].double().cpu()
         move = (reached >= self._upper).long() - (reached < self._lower).long()
         self._queue = torch.cat([self._queue, (batch.notes["row"] + move).clamp(min=0)])
 
     def log(self) -> dict[str, Any]:
-        """Returns counts of levels by bin, and of the last batch the mean row and the last's share.
+        """Returns counts of levels by bin, and the mean row and the share of the last row.
 
         Rows count from 0.
         """

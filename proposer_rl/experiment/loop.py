@@ -1,4 +1,4 @@
-"""The outer loop: a Solver, a curriculum and a budget become a folder of measurements."""
+"""The outer loop: trains Solvers on curricula, and writes a folder of measurements."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from proposer_rl.task import NoSuccessError, Task
 
 
 class Experiment:
-    """The loop over cycles of improving the curriculum and training the Solver on it.
+    """Runs an experiment: improves the curricula in cycles, and trains Solvers on their levels.
 
     Args:
         task: which measures and records.
@@ -95,7 +95,7 @@ class Experiment:
 
     @property
     def seconds(self) -> float:
-        """Wall time of the run, that of its interrupted parts included up to their checkpoints."""
+        """Wall time of the run, including interrupted parts up to their checkpoints."""
         return self._seconds_before + time.monotonic() - self._started
 
     @property
@@ -117,7 +117,7 @@ class Experiment:
         ]
 
     def run(self) -> dict[str, Any]:
-        """Trains to the end of the schedule, from the folder's newest checkpoint if it has one.
+        """Trains to the end of the schedule, from the folder's newest checkpoint if there is one.
 
         Returns:
             The summary of the run, ready for JSON.
@@ -164,7 +164,7 @@ class Experiment:
         return self.summary()
 
     def summary(self) -> dict[str, Any]:
-        """Returns sample efficiency and cost so far, from the metrics in the folder."""
+        """Computes sample efficiency and cost so far from the metrics in the folder."""
         rows = read_csv(self.folder.path / "metrics.csv")
         headline, threshold = self.schedule.headline, self.schedule.threshold
         reached = {
@@ -213,7 +213,7 @@ class Experiment:
                 self._restore(before)
 
     def _log_cycle(self, improved: Sequence[Mapping[str, Any]] | None = None) -> bool:
-        """Writes the logs of the cycle that has ended, and metrics of its improvement."""
+        """Writes the logs of the last cycle with the metrics of the new improvement."""
         logs = [curriculum.log() for curriculum in self.sides.curricula]
         metrics = [
             {**log, **own} for log, own in zip(logs, improved or [{}] * len(logs), strict=True)
@@ -265,7 +265,7 @@ class Experiment:
         return f"{self.schedule.headline} {mean:.3f}"
 
     def _pause(self, due: bool) -> None:
-        """Saves if it is due or a signal came, and then acts on the signal."""
+        """Saves if a checkpoint is due or a signal came, and then obeys the signal."""
         limit = self.schedule.checkpoint_seconds
         late = limit is not None and time.monotonic() - self._saved >= limit
         if due or late or self._signals.pending:
@@ -324,7 +324,7 @@ class Experiment:
 
 
 class SideBySide:
-    """K curricula, and K views of the students that they propose to.
+    """K curricula, each with its view of one of the K Solvers that train side by side.
 
     Args:
         task: of the students.
@@ -348,12 +348,12 @@ class SideBySide:
                 )
 
     def propose(self, count: int, rngs: Sequence[Streams]) -> list[Batch]:
-        """Lets each curriculum propose ``count`` levels from streams of its own."""
+        """Lets each curriculum propose ``count`` levels from its own streams."""
         each = zip(self.curricula, self.students, rngs, strict=True)
         return [proposed(curriculum, student, count, rng) for curriculum, student, rng in each]
 
     def observe(self, credits: Sequence[Sequence[Credit]]) -> None:
-        """Lets each curriculum observe its batches, or parts of some."""
+        """Lets each curriculum observe its batches, or parts of them."""
         for curriculum, student, own in zip(self.curricula, self.students, credits, strict=True):
             for batch, outcome in own:
                 curriculum.observe(student, batch, outcome)
@@ -366,14 +366,14 @@ class SideBySide:
         ]
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the curricula's states, and what each asked of its student."""
+        """Returns the states of the curricula, and the counters of their students."""
         return {
             "curricula": [curriculum.state_dict() for curriculum in self.curricula],
             "asked": [[student.frames, student.evaluations] for student in self.students],
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned."""
         for curriculum, own in zip(self.curricula, state["curricula"], strict=True):
             curriculum.load_state_dict(own)
         for student, (frames, evaluations) in zip(self.students, state["asked"], strict=True):
@@ -382,7 +382,7 @@ class SideBySide:
 
 @settings
 class ScheduleSettings:
-    """Settings of a run's length and of what happens how often, in Solver updates.
+    """Settings of the length of a run and of its intervals, in Solver updates.
 
     Attributes:
         updates: length of the run.
@@ -407,7 +407,7 @@ class ScheduleSettings:
 
 
 def check_headline(task: Task, schedule: ScheduleSettings) -> None:
-    """Refuses a headline that is not measured, and a threshold that it cannot reach.
+    """Refuses a headline that is not measured, or a threshold that it cannot reach.
 
     Raises:
         ArgumentError: if the headline is none of the task's metrics, or a rate that is to reach

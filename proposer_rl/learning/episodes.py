@@ -1,4 +1,4 @@
-"""Measures whole episodes: those of a rollout, and those played on levels."""
+"""Plays and measures whole episodes."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def mean_performance(
     at_once: int | None = None,
     drop_finished: bool = False,
 ) -> TensorDict:
-    """Returns mean return and share of successes of K Solvers over episodes on levels.
+    """Plays episodes of K Solvers on levels; returns mean returns and shares of successes.
 
     The random numbers are those of the levels, the same for every Solver: they differ by what they
     do alone, and what one gets does not depend on which others are evaluated with it.
@@ -131,7 +131,7 @@ def mean_performance(
 
 
 def first_episode_return(rollout: TensorDictBase) -> Tensor:
-    """Returns every environment's sum of rewards in its first episode, as far as it was played.
+    """Returns the sum of rewards in every environment's first episode.
 
     Args:
         rollout: batch [*B, T] with ``("next", "done")`` and ``("next", "reward")`` [*B, T, 1].
@@ -160,7 +160,7 @@ def succeeded(rollout: TensorDictBase) -> Tensor:
 
 
 def first_episode_success(rollout: TensorDictBase) -> Tensor:
-    """Returns whether every environment's first episode succeeded; not if the rollout cut it off.
+    """Returns whether every environment's first episode ended in success within the rollout.
 
     Args:
         rollout: batch [*B, T] with ``("next", "done")`` [*B, T, 1], and what :func:`succeeded`
@@ -182,6 +182,6 @@ def first_episode_success(rollout: TensorDictBase) -> Tensor:
 
 
 def in_first_episode(rollout: TensorDictBase) -> Tensor:
-    """Returns whether each step is at or before the first end of an episode, bool [*B, T]."""
+    """Returns whether each step belongs to the first episode, bool [*B, T]."""
     done = rollout["next", "done"].squeeze(-1).long()
     return done.cumsum(-1) - done == 0

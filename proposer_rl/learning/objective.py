@@ -1,4 +1,4 @@
-"""PPO for K replicas at once: its settings, advantages, the clipped loss, gradients.
+"""PPO's settings, advantages, loss and gradients for K replicas at once.
 
 All of it is TorchRL's, without what would mix replicas or wait for a device; what is reported of a
 step is of each replica by itself, and refused where it is not finite. A rule that joins several
@@ -29,7 +29,7 @@ LEAST_DISCOUNT = 1e-7  # below it, float32 does not know the next reward from no
 
 @settings
 class LearningSettings:
-    """PPO's numbers but for the horizon; the defaults are the paper's for the Solver.
+    """PPO's numbers except the horizon; the defaults are the paper's for the Solver.
 
     Attributes:
         updates: updates on one batch; each computes advantages anew, then runs ``epochs``.
@@ -101,13 +101,13 @@ class SolverSettings:
 
 
 def gae(gamma: float, lmbda: float) -> GAE:
-    """Returns TorchRL's generalised advantage estimation, of values that stand in the rollout."""
+    """Makes TorchRL's generalised advantage estimation for rollouts that contain values."""
     # Its vectorised form splits the batch where episodes end, which it has to look up.
     return GAE(gamma=gamma, lmbda=lmbda, value_network=None, vectorized=False)
 
 
 class LeaveOneOutBaseline(TensorDictModuleBase):
-    """The return to come, minus what the other replicas had to come at the same step.
+    """Computes advantages as returns minus the mean return of the other replicas.
 
     Where all K episodes start from one state, the others' mean return is an unbiased estimate of
     that state's value, and a far better one than a critic that has seen a few episodes
@@ -156,7 +156,7 @@ MakeLoss = Callable[[TensorDictModuleBase, TensorDictModule], LossModule]
 
 
 def make_loss(make: MakeLoss, agent: ActorCritic) -> LossModule:
-    """Returns the loss of an agent's actor and critic, which reads what the agent writes.
+    """Makes the loss of an agent's actor and critic from the entries that the agent writes.
 
     Raises:
         ValueError: if it reduces what belongs to different replicas.
@@ -168,7 +168,7 @@ def make_loss(make: MakeLoss, agent: ActorCritic) -> LossModule:
 
 
 class CopiesClipLoss(ClipPPOLoss):
-    """The clipped loss of every transition, with advantages standardised over each replica's batch.
+    """PPO's clipped loss of every transition, with advantages standardised for each replica.
 
     ``entropy``, ``kl_approx`` and ``clip_fraction`` are of every transition, too, where TorchRL's
     are means over all replicas.
@@ -213,7 +213,7 @@ class CopiesClipLoss(ClipPPOLoss):
         return log_weight, distribution, kl_approx, correction
 
     def loss_critic(self, tensordict: TensorDictBase) -> tuple[Any, ...]:
-        """Returns the critic's term; its old values are those with which the agent acted."""
+        """Returns the critic's term, relative to the values at the time of acting."""
         self._acted_value = tensordict.get(ACTED_VALUE, None)
         return super().loss_critic(tensordict)
 
@@ -233,7 +233,7 @@ class CopiesClipLoss(ClipPPOLoss):
 
 
 def of_copies(numbers: Tensor, copies: int | None) -> Tensor:
-    """Returns means over each replica's batch, [K] or []; a scalar stands for all replicas."""
+    """Averages over each replica's batch, [K] or []; a scalar stands for all replicas."""
     if copies is not None and not numbers.ndim:
         return numbers.expand(copies)
     return numbers.flatten(0 if copies is None else 1).mean(-1)
@@ -279,7 +279,7 @@ def require_finite(
     copies: int | None,
     first: int = 0,
 ) -> None:
-    """Checks one update; costs one number read from the device unless something is wrong.
+    """Checks that an update is finite; reads one number from the device if all is well.
 
     Args:
         reward: of the rollout, [B, ...], B the first dimension of the environment.
@@ -310,7 +310,7 @@ def require_finite(
 
 @contextmanager
 def located(place: str) -> Iterator[None]:
-    """Says in a :class:`DivergedError` from inside where in the run that was."""
+    """Adds to a :class:`DivergedError` raised inside where in the run it happened."""
     try:
         yield
     except DivergedError as error:

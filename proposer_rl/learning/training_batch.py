@@ -1,4 +1,4 @@
-"""Prepares an update: normalises a rollout and cuts it into shuffled minibatches."""
+"""Prepares updates: normalises rollouts and cuts them into shuffled minibatches."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from proposer_rl.settings import ArgumentError
 
 
 class Minibatches:
-    """Cuts rollouts into parts; what is shuffled are steps.
+    """Cuts rollouts into minibatches of shuffled steps or sequences.
 
     They are whole sequences where an agent has a memory, which goes through them, or an encoder,
     which reads a level once for all of its steps.
@@ -50,7 +50,7 @@ class Minibatches:
         self.steps = smallest * length if self._sequences else smallest
 
     def draw(self, generators: Sequence[torch.Generator] | None) -> dict[str, Tensor]:
-        """Draws an update's orders, one for each epoch by its entry's name: int64 [K, N] or [N].
+        """Draws the orders of an update's epochs by entry name: int64 [K, N] or [N].
 
         Replica k's come from the k-th generator; without any, from torch's default one.
         """
@@ -70,7 +70,7 @@ class Minibatches:
     def __call__(
         self, steps: TensorDictBase, level: TensorDictBase, order: Tensor | None
     ) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
-        """Yields the parts of steps [*B, T] in an epoch's order, each with its level.
+        """Yields the minibatches of steps [*B, T] in an epoch's order, each with its level.
 
         Without an order that is all of it as it is.
         """
@@ -102,7 +102,7 @@ class Minibatches:
 
 
 class Statistics:
-    """Gives an agent its normalisation, and takes in what it trains on.
+    """Keeps the running moments by which an agent's observations and values are normalised.
 
     Observations that a rollout has are taken in after it has been trained on, so that training
     begins with the policy that acted; those of the very first one before, since until then there
@@ -141,7 +141,7 @@ class Statistics:
             agent.normalization = numbers.to(next(agent.parameters()).device)
 
     def before(self, rollout: TensorDictBase, level: TensorDictBase, *, first: bool) -> None:
-        """Updates the moments of rewards by a rollout [*B, T], and puts its values into their unit.
+        """Updates the moments of rewards by a rollout [*B, T], and rescales its values.
 
         In the first one, before which nothing was trained on, observations come first.
         """
@@ -160,12 +160,12 @@ class Statistics:
                 rollout.set(key, rollout[key] * change)
 
     def after(self, rollout: TensorDictBase, *, first: bool) -> None:
-        """Updates the moments of observations by a rollout [*B, T] that has been trained on."""
+        """Updates the moments of observations by a rollout [*B, T] that was trained on."""
         if self._agent.normalization is not None and not first:
             self._agent.normalization.update_observations(rollout)
 
     def in_units(self, steps: TensorDictBase) -> TensorDictBase:
-        """Returns steps with values, targets and advantages in the unit of the agent's values."""
+        """Divides values, targets and advantages by the unit of the agent's values."""
         normalization = self._agent.normalization
         if normalization is not None and normalization.returns is not None:
             unit = normalization.unit(steps["state_value"])
@@ -176,7 +176,7 @@ class Statistics:
         return steps
 
     def _discounted(self, rollout: TensorDictBase) -> Tensor:
-        """Returns the sum of an episode's discounted rewards up to each step, float64 [*B, T]."""
+        """Sums the discounted rewards of an episode up to each step, float64 [*B, T]."""
         reward = rollout["next", "reward"].squeeze(-1).double()
         going_on = ~rollout["next", "done"].squeeze(-1)
         sums, so_far = [], self.discounted
