@@ -69,21 +69,20 @@ class Combinator(LearnedCurriculum):
 class Filtered(Combinator):
     """Draws several times as many levels as needed from a curriculum, and keeps some by score.
 
-    The n levels that are kept are drawn one after another, none of them twice, each in proportion
-    to
+    The n levels that are kept are drawn without replacement, each in proportion to
 
-        exp( score / temperature )
+        exp( score / temperature ).
 
-    of those that are left. With learnability p (1 - p) as the score, what is mastered and what is
-    out of reach gets the smallest shares, wherever the levels come from: the idea of SFL
-    (arXiv 2408.15099) and NCC (arXiv 2505.20659), which keep their candidates in a buffer. The
-    curriculum observes the levels that are kept as if it had proposed these alone.
+    With learnability p (1 - p) as the score, levels that are mastered or out of reach get the
+    smallest shares, wherever the levels come from. This is the idea of SFL (arXiv 2408.15099) and
+    NCC (arXiv 2505.20659), which keep their candidates in a buffer. The curriculum observes the
+    kept levels as if it had proposed only these.
 
     Args:
-        curriculum: that draws.
-        scorer: of its levels.
-        times: levels that are drawn for each that is kept.
-        temperature: of the draws among them, in units of the score.
+        curriculum: proposes the candidates.
+        scorer: scores them.
+        times: number of candidates for each level that is kept.
+        temperature: of the draws, in units of the score.
 
     Raises:
         ValueError: if the curriculum is :class:`Mixed`.
@@ -100,7 +99,7 @@ class Filtered(Combinator):
     ) -> None:
         super().__init__([curriculum])
         if _mixes(curriculum):
-            raise ValueError("filter the curricula of a mixture, each by itself, not the mixture")
+            raise ValueError("filter each curriculum of a mixture by itself, not the mixture")
         self.needs = tuple(dict.fromkeys((*self.needs, *scorer.needs)))
         self.required_results = tuple(dict.fromkeys((*self.required_results, *scorer.plays_for)))
         self._scorer, self._times, self._temperature = scorer, times, temperature
@@ -135,11 +134,11 @@ class Filtered(Combinator):
 class Schedule(Combinator):
     """Follows one curriculum after another, as hand-designed ones do.
 
-    Its clock is the number of its own batches, so that it needs no count of the student's updates.
+    It counts its own batches, so it does not need to know the student's updates.
 
     Args:
         stages: curricula, in order.
-        until: number of batches after which each but the last ends, ascending.
+        until: number of batches after which each stage but the last ends, ascending.
 
     Raises:
         ArgumentError: if ``until`` is not ascending or does not fit the stages.
@@ -186,8 +185,8 @@ class Mixed(Combinator):
     """Fills each batch with a fixed share of levels from every curriculum.
 
     Args:
-        curricula: of one kind of levels.
-        shares: of the levels of a batch, not negative; rounded to whole levels so that they add up.
+        curricula: all with the same kind of levels.
+        shares: of each in a batch, not negative; rounded so that whole levels add up.
 
     Raises:
         ArgumentError: if there is not one share for each curriculum, or all are zero.
@@ -214,7 +213,7 @@ class Mixed(Combinator):
             if some
         }
         whose = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
-        # Every level has an entry for each curriculum; of another one than its own, any.
+        # Every level has notes of each curriculum; only those of its own are used.
         place = torch.cat([torch.arange(some) for some in counts])
         notes = {
             str(i): batch.notes[place.clamp(max=len(batch) - 1)] for i, batch in batches.items()
@@ -253,7 +252,7 @@ def draw_without_replacement(logits: Tensor, count: int, generator: torch.Genera
     The largest of the logits with Gumbel noise are such draws (Kool et al. 2019, arXiv 1903.06059).
 
     Args:
-        logits: float [M]; minus infinity for places that are only drawn where no other is left.
+        logits: float [M]; places with minus infinity are only drawn when no others are left.
         count: number n of draws.
         generator: of the CPU.
 

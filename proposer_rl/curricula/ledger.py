@@ -20,7 +20,7 @@ from proposer_rl.task import Levels
 Ids = NDArray[np.int64]
 
 WAITING, OUT, RETURNED, OVER = range(4)
-"""Proposed; handed out; with a result that has not been observed; observed or dropped."""
+"""Proposed; handed out; with a result that is not yet observed; observed or given up."""
 STATES = ("has not been handed out", "", "has been told before", "is over")
 
 
@@ -29,8 +29,8 @@ class Block:
 
     Attributes:
         start, end: the first id, and the one after the last.
-        batch: as it was proposed; see :meth:`Ledger.take` for when it is cut down.
-        levels: those that were proposed, [n].
+        batch: the proposal; :meth:`Ledger.take` may cut it down to some of its levels.
+        levels: all proposed levels, [n].
         state: of each level, uint8 [n].
         results: by name, [n]; NaN or None where there is none yet.
     """
@@ -43,16 +43,16 @@ class Block:
             name: np.full(len(batch), None if kind is object else np.nan, kind)
             for name, kind in kinds.items()
         }
-        self.places: Ids | None = None  # of the levels that the batch is cut down to
+        self.places: Ids | None = None  # of the levels to which the batch was cut down
 
 
 class Found(NamedTuple):
     """Ids that :meth:`Ledger.find` found in one block.
 
     Attributes:
-        block: theirs.
-        which: of the ids that were looked for, int64 [m].
-        place: where these stand in the block, int64 [m].
+        block: that holds them.
+        which: their positions among the ids that were asked for, int64 [m].
+        place: their positions in the block, int64 [m].
     """
 
     block: Block
@@ -63,16 +63,16 @@ class Found(NamedTuple):
 class Ledger:
     """Keeps the levels whose results a curriculum has yet to observe, in the order of proposal.
 
-    Ids count the levels from 0 on. Results come back in any order, in parts or never, and are
+    Ids count levels from 0. Results may come back in any order, in parts or never; they are
     observed in the order of the ids.
 
     Args:
-        kinds: types of the results that are noted of a level, by name: ``float`` or ``object``.
+        kinds: types of the results of a level, by name: ``float`` or ``object``.
 
     Attributes:
         next: the id of the next level.
-        blocks: those in which something is not over.
-        returned: whether there is a result that :meth:`take` has not given.
+        blocks: blocks with levels that are not over.
+        returned: whether there are results that :meth:`take` has not yielded yet.
     """
 
     def __init__(self, kinds: Mapping[str, type]) -> None:
@@ -110,7 +110,7 @@ class Ledger:
         """Locates ids [n], all of which must be handed out.
 
         Raises:
-            ArgumentError: for one that is not out, or stands there twice.
+            ArgumentError: for an id that is not handed out, or is given twice.
         """
         number = np.searchsorted([block.start for block in self.blocks], ids, "right")
         parts = []
@@ -151,7 +151,7 @@ class Ledger:
         """Records the results of one level.
 
         Raises:
-            ArgumentError: if it is not out.
+            ArgumentError: if the level is not handed out.
         """
         block = self.block_of(id)
         place = 0 if block is None else id - block.start
@@ -188,8 +188,8 @@ class Ledger:
         """Yields the results since the last call, block by block, and forgets the levels.
 
         Args:
-            settled: whether a block is taken only when none of its levels waits. Its batch is then
-                cut down to those levels that were not dropped, as if they alone had been proposed.
+            settled: whether to take a block only when none of its levels waits. Its batch is then
+                cut down to the levels that were not given up, as if only these were proposed.
 
         Yields:
             A part of a batch [m], and its results [m] by name.
@@ -245,9 +245,9 @@ class Ledger:
         """Restores what :meth:`state_dict` returned.
 
         Args:
-            state: whose tensors are on the CPU.
-            like: a level of the kind, where levels are to be.
-            device: where results that are tensordicts go.
+            state: with tensors on the CPU.
+            like: a level of the same kind, on the device for the levels.
+            device: for results that are tensordicts.
         """
         self.blocks = []
         for kept in state["blocks"]:

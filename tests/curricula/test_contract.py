@@ -249,7 +249,7 @@ def test_a_student_that_lacks_something_is_named() -> None:
     for task, need, reason in (
         (cars, "target_direction", "MountainCarTask must define differentiable_performance"),
         (cars, "optimal_return", "MountainCarTask must define optimal_return"),
-        (windows, "exact_performance", "ViewMazeTask tells performance by playing, which is not"),
+        (windows, "exact_performance", "ViewMazeTask measures performance by playing, which"),
     ):
         poor = c.TaskStudent(task, task.learner([Streams(0)]))
         c.require(poor, ("play", "probe", "performance"), "plr")

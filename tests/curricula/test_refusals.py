@@ -50,7 +50,7 @@ REFUSED: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (c.RowsCurriculum, {"space": ONE_ROW}, "row=row: has a single row; give it bins"),
     (replay, {"train_on_new": True, "synchronous": True}, "train_on_new=true, synchronous=true: "),
     (replay, {"co_learnability": 1.0, "renew": True}, r"co_learnability=1\.0, renew=true: "),
-    (no_edits, {"edits": 1}, "edits=1: the task has no edit"),
+    (no_edits, {"edits": 1}, "edits=1: the task must define edit"),
     (replay, {"new_levels": {"walls": [1]}}, r"new_levels.walls=\[1.0\]: must be among"),
     (replay, {"new_levels": {"path length": []}}, r"new_levels.path length=\[\]: "),
     (c.AdaptiveDifficulty, {"space": SPACE}, "pass_rates: none: this curriculum needs one of each"),
@@ -77,7 +77,7 @@ REFUSED: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (
         partial(c.Filtered, c.Schedule([c.Mixed(TWO[:1], [1])], [])),
         {"scorer": GivenScores(torch.zeros(1, 1))},
-        "filter the curricula of a mixture, each by itself",
+        "filter each curriculum of a mixture by itself",
     ),
 ]
 
