@@ -122,6 +122,7 @@ class Curriculum:
         needs: names of what it asks of a student; see :class:`~proposer_rl.curricula.Student`.
         required_results: entries of an outcome, beside the return, that it cannot do without:
             ``success``, ``rollout``.
+        optional_results: entries that it learns more from where there are any.
         state: names of its attributes that a resumed run needs: numbers, texts, tensors, lists
             and dicts of these, and objects with a state of their own. Others are for
             :meth:`state_dict`.
@@ -129,6 +130,7 @@ class Curriculum:
 
     needs: tuple[str, ...] = ()
     required_results: tuple[str, ...] = ()
+    optional_results: tuple[str, ...] = ()
     state: ClassVar[tuple[str, ...]] = ()
 
     @classmethod

@@ -205,8 +205,7 @@ class Parameters(LevelSpace, ParameterSpace):
 
     def given(self, levels: TensorDictBase) -> TensorDictBase:
         """Returns levels as loops get them: real numbers in torch's default dtype."""
-        real = torch.get_default_dtype()
-        return levels.apply(lambda one: one.to(real) if one.is_floating_point() else one)
+        return in_default_dtype(levels)
 
     def rows(self, levels: TensorDictBase) -> list[dict[str, Any]]:
         """Returns levels [n] as dicts of numbers and texts."""
@@ -376,8 +375,8 @@ class LevelGenerator(LevelSpace):
     """Levels that a function draws; there are no bins.
 
     Args:
-        draw: ``draw(n, generator)`` gives levels [n]: a tensor, a tensordict or a tensorclass; an
-            array is taken as a tensor.
+        draw: ``draw(n, generator)`` gives levels [n]: a tensor, a tensordict, a tensorclass or an
+            array, which becomes a tensor. Real numbers become those of torch's default dtype.
         target: the same for what is to be mastered; None for no target.
         edit: ``edit(levels, count, generator)``: levels [n] after so many small random edits; None
             where levels cannot be edited.
@@ -458,7 +457,16 @@ def _taken(name: str, levels: Any, count: int) -> Levels:
     if not (collection or isinstance(levels, Tensor)) or tuple(levels.shape[:1]) != (count,):
         found = list(getattr(levels, "shape", ())) or type(levels).__name__
         raise WholeKeyError(f"{name}={found}: must give a tensor or tensordict of {count} levels")
+    levels = in_default_dtype(levels)
     return levels if collection else TensorDict({DRAWN: levels}, [count])
+
+
+def in_default_dtype(levels: Any) -> Any:
+    """Returns levels with their real numbers in torch's default dtype, as networks have theirs."""
+    real = torch.get_default_dtype()
+    if isinstance(levels, Tensor):
+        return levels.to(real) if levels.is_floating_point() else levels
+    return levels.apply(in_default_dtype)
 
 
 def _hash(numbers: Tensor) -> str:

@@ -16,6 +16,7 @@ from proposer_rl.teaching.spaces import (
     LevelSpace,
     Parameters,
     Ranges,
+    in_default_dtype,
 )
 
 Make = Callable[[TensorDictBase, torch.Generator], Any]
@@ -30,7 +31,7 @@ class MadeLevels(Parameters):
     Args:
         ranges: of each parameter, by name; see :class:`Parameters`.
         make: ``make(values, generator)`` gives levels [n] of a tensordict of values [n]: a tensor
-            or a tensordict.
+            or a tensordict. Real numbers are in torch's default dtype on both sides.
         features: ``features(levels)`` gives what a model of outcomes knows of levels [n], numbers
             [n, F], each about -1 to 1; None for the parameters alone.
         bins, target, named: see :class:`Parameters`.
@@ -40,7 +41,7 @@ class MadeLevels(Parameters):
 
     Example:
         >>> def rows(values, generator):
-        ...     x = torch.linspace(0, 1, 5).double()
+        ...     x = torch.linspace(0, 1, 5)
         ...     return values["slope"].unsqueeze(-1) * x + torch.rand(len(values), 5)
         >>> space = MadeLevels({"slope": (0.0, 8.0)}, rows, target={"slope": 8.0})
         >>> space.size, space.given(space.sample(3, torch.Generator())).shape
@@ -65,8 +66,8 @@ class MadeLevels(Parameters):
     def made(self, values: TensorDictBase, generator: torch.Generator) -> TensorDict:
         """Makes levels [n] of values of the parameters [n], and keeps these beside them."""
         kept = values.select(*self.bins)
-        levels = self._make(kept.clone(), generator)
-        return TensorDict({**kept, DRAWN: levels}, kept.batch_size)
+        levels = self._make(in_default_dtype(kept.clone()), generator)
+        return TensorDict({**kept, DRAWN: in_default_dtype(levels)}, kept.batch_size)
 
     def inputs(self, levels: TensorDictBase) -> Tensor:
         """Returns what a belief knows of levels: their features, or else their parameters."""

@@ -43,9 +43,10 @@ from proposer_rl.teaching.results import (
     ended,
     outcome_of_rollout,
 )
-from proposer_rl.teaching.spaces import LevelSpace
+from proposer_rl.teaching.spaces import LevelSpace, in_default_dtype
 from proposer_rl.teaching.tally import Tally
 
+LEAST_BLOCK, LARGEST_BLOCK = 32, 384  # tickets, where the loop does not say how many
 Success = Literal["terminated", "truncated"] | Callable[[TensorDictBase], Tensor]
 
 
@@ -62,9 +63,8 @@ class Teacher:
         ticket, level = teacher.ask()            # or ids, levels = teacher.ask(4096)
         teacher.tell(ticket, return_=r, success=ok)
 
-    The curriculum observes results when it proposes next, at every ``block`` tickets. Replay
-    draws blocks of more than 128 levels at once, which costs a fraction of one after another.
-    Whatever is refused counts nothing, and leaves the teacher as it was.
+    The curriculum observes results when it proposes next, which it does for a block of tickets at
+    once. A refused call has no effect.
 
     Args:
         curriculum: ``prl.curricula.NAME(...)``, its name, or a curriculum of one's own or its
@@ -74,7 +74,8 @@ class Teacher:
         seed: of every random draw.
         device: where levels and tickets are given.
         filter: of the proposed levels, as of :func:`proposer_rl.train`.
-        block: tickets that the curriculum proposes at once; fewer where episodes are few.
+        block: number of tickets that the curriculum proposes at once. None for as many as the loop
+            has out at that moment, from 32 to 384, and never fewer than it asks for.
         success: what in a rollout is a success where it has no such entry: ``"terminated"``,
             ``"truncated"``, or a function of its ``next``; None where termination may be a failure.
         student: what the curriculum may ask of; None for one that can do what ``can`` says.
@@ -114,7 +115,7 @@ class Teacher:
         seed: SupportsIndex = 0,
         device: str | torch.device = "cpu",
         filter: Mapping[str, Any] | str | None = None,
-        block: Count = 384,
+        block: Count | None = None,
         success: Success | None = None,
         student: Student | None = None,
         **can: Any,
@@ -128,18 +129,20 @@ class Teacher:
         self.curriculum, self._made_of = make_curriculum(curriculum, space, filter, self._seed)
         if student is not None and can:
             raise ArgumentError(f"{next(iter(can))}: give it to the student, which is asked alone")
-        given = getattr(space, "given", lambda levels: levels)
+        given = getattr(space, "given", in_default_dtype)
         self.student = student or Student(
             **{name: adapted(name, one, given, self.device) for name, one in can.items()}
         )
         named = curriculum if isinstance(curriculum, str) else getattr(curriculum, "name", None)
         require(self.student, self.curriculum.needs, named or type(self.curriculum).__name__)
-        self._given, self._rows_of = given, getattr(space, "rows", list)
+        self._given = given
+        self._rows_of = getattr(space, "rows", lambda levels: [*given(levels)])
         self._success = success
         kinds = {**dict.fromkeys(RESULTS, float), "rollout": object}
         self._ledger, self._tally = Ledger(kinds), Tally(space)
         self._scored: bool | None = None  # whether results come with a score; None before any
-        self._succeeded: set[bool] = set()  # whether they came with a success, or without
+        self._with_success: bool | None = None  # whether they came with a success
+        self._warned = False  # of success
         self._proposals = self._levels_told = 0  # the latter up to the last log()
         self._whole: list[int] = []  # first tickets of what propose() has given
         self._block, self._counted = None, 0
@@ -225,14 +228,9 @@ class Teacher:
         with self._here():
             self._require("rollout", False, "use observe(rollout)")
             self._require("success", success is not None, "tell it with success=")
-            if type(ids) is int:
-                numbers = {name: as_result(name, value, ()) for name, value in results.items()}
-                self._check_score(results)
-                self._ledger.tell_one(ids, numbers)
-                self._tally.returned(1, numbers["return"], numbers.get("success"))
-            else:
-                self._tell(as_ids("ids", ids), results)
-            self._note_known(results)
+            tickets = ids if type(ids) is int else as_ids("ids", ids)
+            shape = () if type(ids) is int else (len(tickets),)
+            self._tell(tickets, {name: as_result(name, results[name], shape) for name in results})
 
     def predicted(self, ids: Any) -> NDArray[np.float64] | None:
         """Returns the success that the curriculum expected of levels when it proposed them.
@@ -313,8 +311,10 @@ class Teacher:
             else:
                 for name in ("rollout", "success"):
                     self._require(name, name in results, "put it into the outcome")
-                self._tell(tickets, results)
-                self._note_known(results)
+                shape = (len(tickets),)
+                self._tell(
+                    tickets, {name: as_result(name, results[name], shape) for name in results}
+                )
             if ids is None:
                 self._whole.clear()
 
@@ -456,7 +456,9 @@ class Teacher:
         """Returns the block of the next of ``left`` tickets, a new one if the last is used up."""
         block = self._block
         if block is None or (left and self._at == block.end):
-            block = self._next(max(self.block, left))
+            # A loop that loses tickets must not have ever larger blocks.
+            fitting = min(max(self._ledger.out + left, LEAST_BLOCK), LARGEST_BLOCK)
+            block = self._next(max(self.block or fitting, left))
             self._use(block, block.start)
         return block
 
@@ -489,11 +491,34 @@ class Teacher:
         """Returns the levels of a block as the loop gets them, which may change them."""
         return self._given(moved(block.batch.levels, self.device).clone())
 
-    def _tell(self, ids: NDArray[np.int64], results: Mapping[str, Any]) -> None:
-        arrays = {name: as_result(name, value, (len(ids),)) for name, value in results.items()}
-        self._check_score(results)
-        self._ledger.tell(self._ledger.find(ids), arrays)
-        self._tally.returned(len(ids), arrays["return"], arrays.get("success"))
+    def _tell(self, ids: int | NDArray[np.int64], results: Mapping[str, Any]) -> None:
+        """Notes the results of a ticket or of tickets [n], and warns once where success lacks."""
+        scored, known = "score" in results, "success" in results
+        if self._scored not in (None, scored):
+            how = "missing: other levels were told with one" if self._scored else "others had none"
+            raise ArgumentError(f"score: {how}; give it for all or for none")
+        if isinstance(ids, int):
+            self._ledger.tell_one(ids, results)
+        else:
+            self._ledger.tell(self._ledger.find(ids), results)
+        number = 1 if isinstance(ids, int) else len(ids)
+        self._tally.returned(number, results["return"], results.get("success"))
+        self._scored = scored
+        if self._warned:
+            return
+        if not known and "success" in self.curriculum.optional_results:
+            missing = "missing: this curriculum learns more from success than from returns; "
+        elif self._with_success not in (None, known):
+            missing = "told of some levels alone: curricula ignore it then; "
+        else:
+            self._with_success = known
+            return
+        self._warned = True
+        warnings.warn(
+            f"success: {missing}tell it of every level, also of failures, as with tell(..., "
+            'success=), or success="terminated" of LevelTransform and TaughtEnv',
+            stacklevel=3,
+        )
 
     def _observe_rollout(self, ids: NDArray[np.int64], rollout: TensorDictBase) -> None:
         """Notes what came of a rollout [n, T] or [1, n, T], with a row for each ticket."""
@@ -512,26 +537,7 @@ class Teacher:
         }
         results["rollout"] = np.empty(len(ids), object)
         results["rollout"][:] = outcome["rollout"].unbind(0)
-        self._ledger.tell(self._ledger.find(ids), results)
-        self._tally.returned(len(ids), results["return"], results.get("success"))
-
-    def _check_score(self, results: Mapping[str, Any]) -> None:
-        if self._scored not in (None, "score" in results):
-            how = "missing: other levels were told with one" if self._scored else "others had none"
-            raise ArgumentError(f"score: {how}; give it for all or for none")
-
-    def _note_known(self, results: Mapping[str, Any]) -> None:
-        """Notes what came beside returns, and warns, once, of success for some levels alone."""
-        self._scored, known = "score" in results, "success" in results
-        if known not in self._succeeded:
-            self._succeeded.add(known)
-            if len(self._succeeded) == 2:
-                warnings.warn(
-                    "success: told of some levels alone; curricula read it only where all levels "
-                    "that they observe together have one, and mean_success is of those that have; "
-                    "tell it of failures, too",
-                    stacklevel=3,
-                )
+        self._tell(ids, results)
 
     def _require(self, name: str, known: bool, how: str) -> None:
         if name in self.required_results and not known:

@@ -129,13 +129,13 @@ def test_batches_that_are_dropped_are_observed_no_more() -> None:
 
 
 def test_batches_whose_tickets_are_over_are_not_waited_for() -> None:
-    teacher = prl.Teacher(Counting(), ITEMS)
+    teacher = prl.Teacher(Counting(), ITEMS, block=8)
     teacher.propose(4)
     teacher.tell(range(4), [0.0] * 4)
     teacher.ask()  # takes in what was told, so that the batch is forgotten
     with pytest.raises(ArgumentError, match="ids: missing: nothing is out"):
         teacher.observe({"return": [0.0] * 4})
-    first = 4 + teacher.block
+    first = 4 + 8
     teacher.propose(3)
     teacher.drop(range(first, first + 3))
     teacher.propose(2)

@@ -7,6 +7,7 @@ import re
 import warnings
 from collections.abc import Callable
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from hypothesis import given
 from hypothesis import settings as profile
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
+from tensordict import TensorDict
 
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
@@ -196,17 +198,32 @@ def far_target() -> None:
     prl.Parameters({"g": (0.0, 1.0)}, target={"g": {"distribution": "norm", "loc": 5.0}})
 
 
-def some_successes() -> None:
+def told(recipe: Any, *successes: Any) -> Callable[[], None]:
+    def tell() -> None:
+        teacher = prl.Teacher(recipe, LINE)
+        for success in successes:
+            teacher.tell(teacher.ask()[0], 0.0, success)
+
+    return tell
+
+
+def unsuccessful_rollouts() -> None:
     teacher = prl.Teacher("adaptive_mixture", LINE)
-    for success in (None, True, None, True):
-        teacher.tell(teacher.ask()[0], 0.0, success)
+    after = {"reward": torch.ones(2, 3, 1), "done": torch.zeros(2, 3, 1, dtype=torch.bool)}
+    after["done"][:, -1] = True
+    after["terminated"] = after["done"]
+    for _ in range(2):
+        level = teacher.ask(2)[0].view(2, 1, 1).expand(2, 3, 1)
+        teacher.observe(TensorDict({"level_id": level, "next": after}, [2, 3]))
 
 
 @pytest.mark.parametrize(
     ("misread", "message"),
     [
         (far_target, "target.g: most of it, norm.*, lies outside of 0 to 1"),
-        (some_successes, "success: told of some levels alone"),
+        (told("plr", None, True, None, True), "success: told of some levels alone"),
+        (told("adaptive_mixture", None, True, None), "success: missing: this curriculum learns"),
+        (unsuccessful_rollouts, "success: missing: this curriculum learns"),
     ],
 )
 def test_what_may_be_misread_is_said_once(misread: Callable[[], None], message: str) -> None:
@@ -215,15 +232,44 @@ def test_what_may_be_misread_is_said_once(misread: Callable[[], None], message: 
     assert len(said) == 1
 
 
+@pytest.mark.parametrize("told_", [told("adaptive_mixture", 0, 1), told("plr", None, None)])
+def test_nothing_is_said_of_success_that_is_told_or_not_used(told_: Callable[[], None]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        told_()
+
+
+def doubles(n: int, generator: torch.Generator) -> torch.Tensor:
+    return torch.rand(n, 3, generator=generator, dtype=torch.float64)
+
+
+REAL = {
+    "parameters": lambda: LINE,
+    "a logarithmic scale": lambda: prl.Parameters({"s": prl.Log(0.01, 1.0)}),
+    "drawn": lambda: prl.LevelGenerator(doubles, target=doubles),
+    "drawn by name": lambda: prl.LevelGenerator(lambda n, g: TensorDict({"s": doubles(n, g)}, [n])),
+    "made": lambda: prl.MadeLevels({"s": (0.0, 1.0)}, lambda values, g: doubles(len(values), g)),
+    "a task": lambda: SimpleNamespace(space=prl.Parameters({"s": (0.0, 1.0)})),
+}
+
+
+@pytest.mark.parametrize("space", REAL)
+def test_a_network_takes_the_levels_of_every_space(space: str) -> None:
+    """Whoever asks gets torch's default dtype; a parameter by itself is a number of Python's."""
+    teacher = prl.Teacher("domain_randomization", REAL[space]())
+    for levels in (teacher.propose(4), teacher.ask(4)[1], teacher.ask()[1]):
+        entries = [levels] if isinstance(levels, torch.Tensor) else [*levels.values()]
+        for entry in entries:
+            assert type(entry) is float or entry.dtype is torch.float32
+
+
 def test_an_array_that_a_function_draws_is_a_tensor() -> None:
     def draw(n: int, generator: torch.Generator) -> Any:
         return np.arange(3.0 * n).reshape(n, 3)[::-1]
 
     space = prl.LevelGenerator(draw, target=draw, edit=lambda levels, count, g: levels.numpy() + 1)
     _, drawn = prl.Teacher("target", space).ask(4)
-    assert (
-        drawn.dtype == torch.float64 and drawn.tolist() == draw(384, torch.Generator())[:4].tolist()
-    )
+    assert drawn.tolist() == draw(32, torch.Generator())[:4].tolist()
     batch = space.sample(4, torch.Generator())[None]
     assert (space.edit(batch, 1, [torch.Generator()])["level"] == batch["level"] + 1).all()
 

@@ -236,6 +236,33 @@ def test_a_recipe_and_its_name_have_one_state() -> None:
     prl.Teacher("plr", SPACE).load_state_dict(prl.Teacher(C.plr(), SPACE).state_dict())
 
 
+@pytest.mark.parametrize(
+    ("size", "comes_back", "block", "expected"),
+    [
+        (1, True, None, 32),
+        (48, True, None, 48),
+        (600, True, None, 384),
+        (48, False, None, 384),  # tickets that are lost make no larger ones
+        (48, True, 20, 20),
+    ],
+)
+def test_a_block_is_what_the_loop_has_out_at_once(
+    size: int, comes_back: bool, block: int | None, expected: int
+) -> None:
+    """In a batch of environments, of which a third ends in every step."""
+    spy = Counting()
+    teacher = prl.Teacher(spy, prl.Items(10**6), block=block)
+    ids, last = teacher.ask(size)[0], 0
+    for step in range(200):
+        some = (torch.arange(size) + step) % 3 == 0
+        if comes_back:
+            teacher.tell(ids[some], torch.zeros(int(some.sum())))
+        before = spy.count
+        ids[some] = teacher.ask(int(some.sum()))[0]
+        last = spy.count - before or last
+    assert last == expected
+
+
 LOGGED = ["proposed", "told", "dropped", "out", "mean_return", "mean_success", "drawn"]
 
 
@@ -325,7 +352,8 @@ def test_made_levels_have_bins_a_target_and_edits() -> None:
     old = space.generate(torch.tensor([[0, 3]]), g)
     new = space.edit(old, 3, g)
     for one in (old, new, space.at(torch.tensor([[[0.5], [-1.0]]]), g)):
-        torch.testing.assert_close(one["level"][..., 2] - one["level"][..., 1], one["slope"])
+        rise = one["level"][..., 2] - one["level"][..., 1]
+        torch.testing.assert_close(rise, one["slope"].float())
     assert (old["slope"] != new["slope"]).all()
     model = prl.MadeLevels(ONE, hills, features=lambda levels: levels[..., :1])
     assert model.features(old).shape == (1, 2, 1)
