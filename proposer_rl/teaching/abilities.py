@@ -1,4 +1,4 @@
-"""Students of loops, made of the loop's own functions."""
+"""Adapts functions of a training loop to what curricula call."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ OF_LEVELS = ("optimal_return", "exact_performance", "performance", "play")
 
 
 def adapted(name: str, function: Any, given: Callable[[Any], Any], device: torch.device) -> Any:
-    """Returns a function of levels [n] that calls a loop's own, with levels as the loop gets them.
+    """Wraps a loop's function of levels [n], so that it gets levels as the loop does.
 
     Args:
-        name: of the function; see :class:`~proposer_rl.curricula.Student`.
-        function: of a loop.
-        given: makes the loop's levels of levels.
-        device: on which it gets them.
+        name: the function's name in :class:`~proposer_rl.curricula.Student`.
+        function: the loop's function.
+        given: converts levels for the loop.
+        device: the device on which the loop gets levels.
     """
     if name not in OF_LEVELS:
         return function
 
     def of_levels(levels: Any, *more: Any) -> Any:
         draws = more if name == "play" else ()
-        found = function(given(moved(levels, device).clone()), *draws)  # which may change them
+        found = function(given(moved(levels, device).clone()), *draws)  # it may change the copy
         if isinstance(found, dict):
             entries = {key: torch.as_tensor(entry).float() for key, entry in found.items()}
             return TensorDict(entries, levels.shape[:1])

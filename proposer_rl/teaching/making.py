@@ -1,4 +1,4 @@
-"""A curriculum by name for a space of levels, without a run."""
+"""Makes a teacher's curriculum, without a run."""
 
 from __future__ import annotations
 
@@ -20,12 +20,15 @@ def make_curriculum(
     filter: Mapping[str, Any] | str | None,
     seed: int,
 ) -> tuple[Curriculum, dict[str, Any]]:
-    """Returns the curriculum on the levels of a space or task; by name, with its file's filter.
+    """Makes a curriculum on the levels of a space or task, with its filter.
 
     Returns:
-        The curriculum; its name or class and all its settings, for JSON.
+        The curriculum; and its name or class with all its settings, for JSON.
+
+    Raises:
+        ArgumentError: if the space is none, or the curriculum trains replicas of the learner.
     """
-    if isinstance(space, type) or not hasattr(space, "space"):
+    if not hasattr(space, "space"):
         raise ArgumentError(
             f"space={shown(space)}: must be Parameters, Items, LevelGenerator, MadeLevels or a task"
         )
@@ -42,7 +45,7 @@ def make_curriculum(
     if isinstance(made, LearnedCurriculum) and made.trains_replicas:
         raise ArgumentError(
             f"curriculum={type(made).__name__}: trains replicas of the learner; use "
-            "proposer_rl.train, or SolverTrainingEnv for learners of your own"
+            "proposer_rl.train, or SolverTrainingEnv with your own learner"
         )
     own = config.pop("curriculum", {})
     own.pop("_target_", None)

@@ -1,4 +1,4 @@
-"""Levels of any structure that a function makes of named parameters."""
+"""Levels of any structure, which a function makes from named parameters."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ Make = Callable[[TensorDictBase, torch.Generator], Any]
 
 
 class MadeLevels(Parameters):
-    """Levels that a function makes of parameters, such as terrains of a slope and a roughness.
+    """Levels that a function makes from parameters, such as terrains from slope and roughness.
 
-    The parameters are what curricula tell levels apart by: their bins, the target, and small edits,
-    after which the level is made anew. What a loop gets is the level alone.
+    Curricula see the parameters: their bins, the target, and small edits, after which the level is
+    made anew. The loop gets only what the function returns.
 
     Args:
-        ranges: of each parameter, by name; see :class:`Parameters`.
-        make: ``make(values, generator)`` gives levels [n] of a tensordict of values [n]: a tensor
-            or a tensordict. Real numbers are in torch's default dtype on both sides.
-        features: ``features(levels)`` gives what a model of outcomes knows of levels [n], numbers
-            [n, F], each about -1 to 1; None for the parameters alone.
+        ranges: the values of each parameter, by name; see :class:`Parameters`.
+        make: ``make(values, generator)`` returns levels [n] for a tensordict of values [n]: a
+            tensor or a tensordict. Real numbers are in torch's default dtype on both sides.
+        features: ``features(levels)`` returns numbers [n, F] that describe levels [n], each about
+            -1 to 1; None for the parameters.
         bins, target, named: see :class:`Parameters`.
 
     Raises:
@@ -64,13 +64,13 @@ class MadeLevels(Parameters):
         self.distributions = {"all": self, **parts}
 
     def made(self, values: TensorDictBase, generator: torch.Generator) -> TensorDict:
-        """Makes levels [n] of values of the parameters [n], and keeps these beside them."""
+        """Makes levels [n] from values of the parameters [n], and stores the values with them."""
         kept = values.select(*self.bins)
         levels = self._make(in_default_dtype(kept.clone()), generator)
         return TensorDict({**kept, DRAWN: in_default_dtype(levels)}, kept.batch_size)
 
     def inputs(self, levels: TensorDictBase) -> Tensor:
-        """Returns what a belief knows of levels: their features, or else their parameters."""
+        """Returns the inputs of a belief for levels: their features, or else their parameters."""
         return super().inputs(levels) if self._features is None else self.features(levels)
 
     def given(self, levels: TensorDictBase) -> Any:
@@ -78,7 +78,7 @@ class MadeLevels(Parameters):
         return levels[DRAWN]
 
     def rows(self, levels: TensorDictBase) -> list[Any]:
-        """Returns levels [n] one by one."""
+        """Returns levels [n] as a list."""
         return LevelSpace.rows(self, levels)
 
     def at(self, points: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
@@ -89,7 +89,7 @@ class MadeLevels(Parameters):
     def between(
         self, a: TensorDictBase, b: TensorDictBase, noise: float, generator: torch.Generator
     ) -> TensorDict:
-        """Makes levels [n] of values at random places between those of two each."""
+        """Makes levels [n] from values at random places between those of ``a`` and ``b``."""
         return self.made(super().between(a, b, noise, generator), generator)
 
     def _draw(self, choices: Tensor, generator: torch.Generator) -> TensorDict:

@@ -190,7 +190,7 @@ def test_numbers_may_be_of_any_kind() -> None:
     teacher.drop(ids[6])
     assert len(teacher.propose(np.int64(3))) == 3
     assert [total for total, _ in curriculum.seen.values()] == [0.5, 1.5, 2.5, 3.5, 4.5, 5.5]
-    with pytest.raises(ArgumentError, match=r"ids=tensor\(7\.\): must be whole numbers"):
+    with pytest.raises(ArgumentError, match=r"ids=7\.0: must be whole numbers"):
         teacher.tell(torch.tensor(7.0), 0.0)
     with pytest.raises(ArgumentError, match=r"seed=1\.5: must be a whole number"):
         prl.Teacher(Counting(), ITEMS, seed=1.5)  # type: ignore[arg-type]
