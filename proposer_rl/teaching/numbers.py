@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -50,10 +51,11 @@ def as_numbers(
     inside = shape == () and type(value) in (int, float) and low <= value <= high
     if inside and (not whole or value % 1 == 0):
         return np.float64(value)  # type: ignore[return-value]
-    try:
+    array = None
+    with suppress(TypeError, ValueError, OverflowError):
         array = _array(value)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ArgumentError(f"{name}={shown(value)}: must be numbers of float32") from error
+    if array is None:
+        raise ArgumentError(f"{name}={shown(value)}: must be numbers of float32")
     if shape is not None:
         if spread and not array.ndim:
             array = np.full([one or 0 for one in shape], array)
@@ -73,7 +75,8 @@ def as_numbers(
     return array
 
 
-def _array(value: Any) -> NDArray[np.float64]:
+def _array(value: Any) -> NDArray[np.float64] | None:
+    """Returns numbers as an array; None for complex numbers, texts and the like."""
     if isinstance(value, Tensor):
         value = value.detach().cpu()
         value = (value if value.is_complex() else value.double()).numpy()  # also of bfloat16
@@ -81,8 +84,8 @@ def _array(value: Any) -> NDArray[np.float64]:
         special = Tensor, np.ma.MaskedArray
         value = [_array(one) if isinstance(one, special) else one for one in value]
     array = np.asarray(value)
-    if array.dtype.kind not in "biufO":  # complex numbers, texts and the like
-        raise TypeError(array.dtype)
+    if array.dtype.kind not in "biufO":
+        return None
     array = array.astype(np.float64)
     if isinstance(value, np.ma.MaskedArray):
         array[np.ma.getmaskarray(value)] = np.nan

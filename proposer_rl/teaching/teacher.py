@@ -29,9 +29,8 @@ from proposer_rl.runs.folder import storage
 from proposer_rl.settings import ArgumentError, Count, checked, whole
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels, Task
-from proposer_rl.teaching.abilities import adapted
 from proposer_rl.teaching.identity import of_levels, require_same
-from proposer_rl.teaching.making import make_curriculum
+from proposer_rl.teaching.making import adapted, make_curriculum
 from proposer_rl.teaching.numbers import as_ids
 from proposer_rl.teaching.remote import TeacherClient, TeacherServer
 from proposer_rl.teaching.results import (

@@ -29,7 +29,7 @@ class TaughtReward(TrainerCallback):
         trainer.train()
 
     Groups and their repetitions follow from the trainer's config; an epoch has as many prompts as
-    the training set has rows. Rewards of evaluation are not told. Checkpoints hold the curriculum,
+    the training set has rows. Evaluation has no effect. Checkpoints hold the curriculum,
     and ``train(resume_from_checkpoint=...)`` goes on with it. In a launch of several ranks, write
     the same on each. The trainer logs :meth:`TeacherSampler.metrics` as ``curriculum/...``.
 
