@@ -11,8 +11,14 @@ import numpy as np
 from torch import Tensor
 
 from proposer_rl.settings import ArgumentError
-from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, as_number, entries, stepped
-from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, mismatch, write_attribute
+from proposer_rl.tasks.gymnasium.environment import (
+    UnfitEnvironmentError,
+    as_number,
+    entries,
+    mismatch,
+    stepped,
+    write_attribute,
+)
 from proposer_rl.tasks.parameters import SEED
 from proposer_rl.teaching.remote import TeacherClient
 from proposer_rl.teaching.teacher import Teacher
@@ -173,7 +179,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         for name, path in how.items():
             try:
                 write_attribute(self.env.unwrapped, path, _plain(self._level[name]))
-            except AttributeRefusedError as error:
+            except UnfitEnvironmentError as error:
                 raise ArgumentError(f"set.{name}={path!r}: {error}") from error
         left_out = [name for name in names if name not in (*how, SEED)]
         if left_out and not self._began:

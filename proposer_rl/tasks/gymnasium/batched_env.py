@@ -27,7 +27,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from proposer_rl.models import available_cores, check_torch_defaults
-from proposer_rl.tasks.gymnasium.answers import SuccessSettings, UnfitEnvironmentError
+from proposer_rl.tasks.gymnasium.environment import SuccessSettings, UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.player import (
     GymLevel,
     LevelPlayer,

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
-from functools import cached_property, partial
-from importlib import import_module
+from functools import cached_property
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Annotated, Any, Literal, NamedTuple
 
 import gymnasium
@@ -16,13 +16,14 @@ from annotated_types import Len
 from gymnasium.wrappers import TimeLimit
 
 from proposer_rl.settings import settings
-from proposer_rl.tasks.gymnasium.answers import (
+from proposer_rl.tasks.gymnasium.environment import (
     Step,
     SuccessSettings,
     UnfitEnvironmentError,
+    mismatch,
     stepped,
+    write_attribute,
 )
-from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, mismatch, write_attribute
 from proposer_rl.tasks.gymnasium.spaces import Layout, typed
 from proposer_rl.tasks.parameters import MOST_BINS, SEED
 from proposer_rl.tasks.ranges import RangeSettings, value_text
@@ -67,13 +68,6 @@ class ParameterSettings(RangeSettings):
         return deepcopy(value if self.to is None else self.to[(self.values or []).index(value)])
 
 
-def wrapper_error(wrapper: WrapperSettings, error: Exception | str) -> UnfitEnvironmentError:
-    """Returns what is wrong with a wrapper, as an error that another process can send."""
-    name = wrapper if isinstance(wrapper, str) else next(iter(wrapper))
-    reason = error if isinstance(error, str) else cause(error)
-    return UnfitEnvironmentError(f"wrappers: {name}: {reason}")
-
-
 @dataclass(frozen=True)
 class MakeEnvironment:
     """Makes an environment; can be sent to another process.
@@ -96,29 +90,17 @@ class MakeEnvironment:
         """
         env: gymnasium.Env[Any, Any] = gymnasium.make(
             self.env_id,
-            max_episode_steps=-1,
+            max_episode_steps=self.max_steps,
             disable_env_checker=True,
             **{**self.arguments, **arguments},
         )
-        limit = self.limit(env)
-        if limit is not None:
-            env = TimeLimit(env, limit)
         for wrapper in self.wrappers:
+            ((name, given),) = ({wrapper: {}} if isinstance(wrapper, str) else wrapper).items()
             try:
-                env = wrapper_of(wrapper)(env)
+                env = imported(name)(env, **given)
             except Exception as error:
-                raise wrapper_error(wrapper, error) from error
+                raise UnfitEnvironmentError(f"wrappers: {name}: {cause(error)}") from error
         return env
-
-    def limit(self, env: gymnasium.Env[Any, Any]) -> int | None:
-        """Returns the steps after which an episode is truncated; None for never."""
-        limits = [limit._max_episode_steps for limit in _time_limits(env)]
-        declared = self.max_steps
-        if declared is None and env.unwrapped.spec is not None:
-            declared = gymnasium.spec(env.unwrapped.spec.id).max_episode_steps
-        if declared is not None:
-            limits.append(declared)
-        return min(limits, default=None)
 
 
 class GymLevel(NamedTuple):
@@ -193,13 +175,13 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Returns whether no time limit is reached, each counting the steps that it has seen."""
         return all(
             (limit._elapsed_steps or 0) < limit._max_episode_steps
-            for limit in _time_limits(self.env)
+            for limit in time_limits(self.env)
         )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode on the level, which has its own seed and options."""
+        """Begins an episode on the level, with the level's own seed and options."""
         if self._once and self._played:
             self._still = True
             return self._seen, {}
@@ -211,14 +193,12 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
                 seed=self._play.seed, **({"options": given} if given else {})
             )
             self._seen = typed(self.observation_space, seen)
-        except UnfitEnvironmentError as error:
-            raise UnfitEnvironmentError(f"{error}, on the level {self._play}") from error
         except Exception as error:
-            raise self._refused(error) from error
+            raise self._fault("reset", error) from error
         return self._seen, {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Takes a step, unless the episode of an evaluation is over."""
+        """Takes a step, unless the only episode of an evaluation is over."""
         if self._still:
             return self._seen, 0.0, False, False, {}
         rule = self._success
@@ -231,15 +211,13 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             if rule is not None and (over or rule.once):
                 step = Step(terminated, truncated, self.in_time, self._return, self.last_info)
                 self._succeeded = rule(step) or self._succeeded
-        except Exception as error:  # whatever an environment of somebody's may raise
-            unfit = isinstance(error, UnfitEnvironmentError)
-            said = str(error) if unfit else f"step raises {cause(error)}"
-            raise UnfitEnvironmentError(f"{said}, on the level {self._play}") from error
+        except Exception as error:
+            raise self._fault("step", error) from error
         info = {"success": True} if over and self._succeeded else {}
         return self._seen, reward, terminated, truncated, info
 
     def mismatches(self) -> str | None:
-        """Returns a line on what of the level the environment has lost; None where all is there."""
+        """Describes in a line an attribute that no longer has the level's value; None for none."""
         for name, how, path in self._ways:
             line = how == "attribute" and mismatch(self.env, path, self._value(name))
             if line:
@@ -252,28 +230,22 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             self.env = self._built()
         inner = self.env.unwrapped
         for name, how, path in self._ways:
-            value = self._value(name)
-            if how == "attribute":
-                try:
-                    write_attribute(inner, path, value)
-                except AttributeRefusedError as error:
-                    raise UnfitEnvironmentError(f"parameters.{name}: {error}") from error
-            elif how == "call":
-                try:
-                    imported(path)(inner, value)
-                except Exception as error:
-                    raise self._refused(error) from error
+            try:
+                if how == "attribute":
+                    write_attribute(inner, path, self._value(name))
+                elif how == "call":
+                    imported(path)(inner, self._value(name))
+            except Exception as error:
+                raise UnfitEnvironmentError(f"parameters.{name}: {cause(error)}") from error
 
     def _built(self) -> gymnasium.Env[Any, Any]:
         self._arguments = self._named("argument")
         try:
             return self.make(**self._arguments)
-        except (ImportError, gymnasium.error.Error, UnfitEnvironmentError):
+        except (ImportError, gymnasium.error.Error):
             raise
         except Exception as error:
-            if self._arguments:
-                raise self._refused(error) from error
-            raise UnfitEnvironmentError(f"it cannot be made: {cause(error)}") from error
+            raise self._fault("the constructor", error) from error
 
     def _named(self, way: str) -> dict[str, Any]:
         """Returns the values that are set in one way, by the names that they have there."""
@@ -282,49 +254,36 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _value(self, parameter: str) -> Any:
         return self.parameters[parameter].given(self._play.values[parameter])
 
-    def _refused(self, error: Exception) -> UnfitEnvironmentError:
-        return UnfitEnvironmentError(
-            f"parameters: {self.make.env_id} refuses {self._play}: {cause(error)}"
-        )
+    def _fault(self, doing: str, error: Exception) -> UnfitEnvironmentError:
+        """Returns what an environment raises, whatever that is, as an error with the level."""
+        raises = "" if isinstance(error, UnfitEnvironmentError) else f"{doing} raises "
+        return UnfitEnvironmentError(f"{raises}{cause(error)}, on the level {self._play}")
 
 
-def _time_limits(env: Any) -> Iterator[TimeLimit]:
+def time_limits(env: Any) -> Iterator[TimeLimit]:
+    """Yields the wrappers of an environment that limit its episodes' steps."""
     while isinstance(env, gymnasium.Wrapper):
         if isinstance(env, TimeLimit):
             yield env
         env = env.env
 
 
-def wrapper_of(settings: WrapperSettings) -> Callable[..., Any]:
-    """Returns what puts a wrapper around an environment.
+def imported(name: str) -> Any:
+    """Returns what has a dotted name, and imports its module.
 
     Raises:
-        ValueError: if there is no such thing.
+        UnfitEnvironmentError: if there is no such thing.
     """
-    if isinstance(settings, str):
-        return imported(settings)
-    ((name, arguments),) = settings.items()
-    return partial(imported(name), **arguments)
-
-
-def imported(name: str) -> Callable[..., Any]:
-    """Returns what a dotted name stands for.
-
-    Raises:
-        ValueError: if there is no such thing.
-    """
-    module, _, last = name.rpartition(".")
     try:
-        result = getattr(import_module(module), last)
+        return resolve_name(name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"{name!r}: cannot be imported: {error}") from error
-    if not callable(result):
-        raise ValueError(f"{name!r}: must be something to call")
-    return result
+        raise UnfitEnvironmentError(f"{name!r} cannot be imported: {error}") from error
 
 
 def cause(error: Exception) -> str:
-    """Returns an environment's exception as part of a line, with the place that raised it."""
+    """Returns an exception as part of a line, with the place that raised it unless it is ours."""
+    if isinstance(error, UnfitEnvironmentError):
+        return str(error)
     *_, last = traceback.extract_tb(error.__traceback__)
     reason = " ".join(str(error).split()) or "no reason given"
     return f"{type(error).__name__}: {reason} ({Path(last.filename).name}, line {last.lineno})"

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.data import Categorical, MultiCategorical, TensorSpec, Unbounded
 
 from proposer_rl.settings import shown
-from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
+from proposer_rl.tasks.gymnasium.environment import UnfitEnvironmentError
 
 # Spaces whose values are one number or an array of them.
 NUMERIC = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary

@@ -27,8 +27,8 @@ from proposer_rl.runs.records import png
 from proposer_rl.settings import settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
-from proposer_rl.tasks.gymnasium.answers import SuccessSettings, UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.batched_env import FLAGS, GymnasiumEnv, Vectorization, plays
+from proposer_rl.tasks.gymnasium.environment import SuccessSettings, UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork, solver_network
 from proposer_rl.tasks.gymnasium.pictures import FRAMES, NO_FRAMES, Camera
 from proposer_rl.tasks.gymnasium.player import (
@@ -295,16 +295,15 @@ class GymnasiumTask(Task):
         return seen, acts
 
 
-OWN_MOMENTS = (
-    "it keeps running statistics, other ones in evaluations: take PPO's normalize_observations and "
-    "normalize_rewards"
-)
 # What would mislead: it trains on something else than what is measured, or never ends an episode.
 MISLEADING: dict[type[Transform], str] = {
-    envs.VecNorm: OWN_MOMENTS,
-    envs.VecNormV2: OWN_MOMENTS,
-    envs.FrameSkipTransform: "it steps on beyond an episode's end: take one of wrappers",
-    envs.StepCounter: "the environment does not see its max_steps: take the task's",
+    **dict.fromkeys(
+        (envs.VecNorm, envs.VecNormV2),
+        "it keeps running statistics, other ones in evaluations; use PPO's "
+        "normalize_observations and normalize_rewards",
+    ),
+    envs.FrameSkipTransform: "it steps on beyond an episode's end; use one of wrappers",
+    envs.StepCounter: "the environment does not see its max_steps; use the task's",
 }
 
 
@@ -312,7 +311,7 @@ def _checked_transforms(transforms: Iterable[Any]) -> Iterator[Transform]:
     """Yields the transforms one by one, also those of a Compose.
 
     Raises:
-        ValueError: for what is none, keeps running statistics, or mistakes where episodes end.
+        ValueError: for one that is none, keeps running statistics, or mistakes where episodes end.
     """
     for one in transforms:
         if isinstance(one, envs.Compose):
@@ -320,7 +319,7 @@ def _checked_transforms(transforms: Iterable[Any]) -> Iterator[Transform]:
             continue
         why = next((why for kind, why in MISLEADING.items() if isinstance(one, kind)), "")
         if not isinstance(one, Transform):
-            why = "must be a transform of TorchRL's, as {_target_: torchrl.envs.StepCounter}"
+            why = "must be a transform of TorchRL, as {_target_: torchrl.envs.RewardClipping}"
         if why and getattr(one, "max_steps", True) is not None:  # a StepCounter may only count
             raise ValueError(f"transforms: {type(one).__name__}: {why}")
         yield one
@@ -334,18 +333,16 @@ def _copied(transform: Transform) -> Transform:
 
 @contextmanager
 def _named(env_id: str, extra: str | None) -> Iterator[None]:
-    """Says in one line what is wrong with an environment that cannot be made."""
+    """Puts the key before what is wrong with an environment, and says how to install a package."""
     try:
         yield
     except (ImportError, gymnasium.error.DependencyNotInstalled) as error:
-        how = f"install it with: {install_command(extra)}" if extra else "install it"
         reason = " ".join(str(error).split())
-        if not extra and (own := where_to_look(error)):
-            raise ValueError(f"env_id={env_id}: {reason}{own}") from error
-        raise ValueError(f"env_id={env_id}: a package is missing; {how} ({reason})") from error
+        how = f"; install it with: {install_command(extra)}" if extra else where_to_look(error)
+        raise ValueError(f"env_id={env_id}: {reason}{how}") from error
     except gymnasium.error.Error as error:
         unknown = isinstance(error, gymnasium.error.NameNotFound) and ":" not in env_id
-        own = "; one's own comes after its module, as module:Name-v0" if unknown else ""
+        own = "; name the module of your own one before it, as module:Name-v0" if unknown else ""
         raise ValueError(f"env_id={env_id}: {str(error).rstrip('.')}{own}") from error
     except UnfitEnvironmentError as error:
         own_key = str(error).startswith(("success.", "parameters", "wrappers"))

@@ -20,8 +20,8 @@ from torchrl.envs.utils import check_env_specs
 from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium import batched_env
-from proposer_rl.tasks.gymnasium.answers import Step, SuccessSettings
 from proposer_rl.tasks.gymnasium.batched_env import GymnasiumEnv, LostProcessError
+from proposer_rl.tasks.gymnasium.environment import Step, SuccessSettings
 from proposer_rl.tasks.gymnasium.player import GymLevel, LevelPlayer, MakeEnvironment
 from proposer_rl.tasks.parameters import ParameterSpace
 from tests.processes import ROOT
@@ -145,7 +145,7 @@ def test_locks_that_are_held_while_its_processes_start_are_free_in_them() -> Non
 
 SCRIPT = """
 import gymnasium, numpy, proposer_rl.tasks.gymnasium.batched_env as batched, torch
-from proposer_rl.tasks.gymnasium.answers import SuccessSettings
+from proposer_rl.tasks.gymnasium.environment import SuccessSettings
 from proposer_rl.tasks.gymnasium.player import MakeEnvironment
 from proposer_rl.tasks.parameters import ParameterSpace
 SPACE = gymnasium.spaces.Box(-1, 1, (2,), numpy.float32)
