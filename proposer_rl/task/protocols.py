@@ -321,11 +321,3 @@ def refuse_unfit_bins(space: Space) -> None:
         raise ValueError(
             "the space has a single bin, so there is nothing to choose among; give its axes bins"
         )
-
-
-def named(key: str, make: Any, *arguments: Any) -> Any:
-    """Makes something of arguments, and names their key in what is wrong with them."""
-    try:
-        return make(*arguments)
-    except ValueError as error:
-        raise ValueError(f"{key}: {error}") from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import torch
 from annotated_types import Ge
@@ -15,8 +15,8 @@ from torchrl.envs import EnvBase
 
 from proposer_rl.learning import SolverSettings
 from proposer_rl.models import check_torch_defaults, population
-from proposer_rl.settings import ArgumentError, signed
-from proposer_rl.task import ComputeContext, Levels, Task, named
+from proposer_rl.settings import ArgumentError, signed, within
+from proposer_rl.task import ComputeContext, Levels, Task
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings, solver_network
 from proposer_rl.tasks.gymnasium.player import imported
 from proposer_rl.tasks.parameters import SEED
@@ -334,7 +334,8 @@ class BatchedTask(Task):
 
 
 def _environment_class(name: str) -> type[BatchedEnv]:
-    kind = named("env", imported, name)
+    with within("env", ValueError):
+        kind: Any = imported(name)
     if not (isinstance(kind, type) and issubclass(kind, BatchedEnv)):
         raise ArgumentError(f"env={name!r}: must be a subclass of BatchedEnv")
     return kind

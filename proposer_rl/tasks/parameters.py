@@ -220,19 +220,19 @@ class Law(Bins):
         return self.name
 
 
-def points(values: Sequence[Number], key: str = "values") -> Bins:
+def points(values: Sequence[Number]) -> Bins:
     """Returns bins that are single values; whole numbers, if all of them are.
 
     Raises:
-        ValueError: naming the key, if they do not rise, or are beyond float32 or int64.
+        ValueError: if they do not rise, or are beyond float32 or int64.
     """
     whole = all(isinstance(value, int) for value in values)
     largest = LARGEST_WHOLE if whole else LARGEST
     if not all(abs(value) <= largest for value in values):
-        raise ValueError(f"{key}={list(values)} must be finite, and at most {largest:g} in size")
+        raise ValueError(f"values={list(values)} must be finite, and at most {largest:g} in size")
     line = torch.tensor(values, dtype=torch.int64 if whole else torch.float64)
     if (line.diff() <= 0).any():
-        raise ValueError(f"{key}={list(values)} must rise")
+        raise ValueError(f"values={list(values)} must rise")
     return Bins(line, line)
 
 
@@ -240,14 +240,14 @@ def intervals(low: float, high: float, count: int = 1, log: bool = False) -> Bin
     """Returns equal parts of a range, within which values are uniform, or their logarithms are.
 
     Raises:
-        ValueError: if the range is none, or goes beyond float32, or to 0 on a logarithmic scale.
+        ValueError: if the ends do not rise, are beyond float32, or with ``log`` not above 0.
     """
-    if not -LARGEST <= low < high <= LARGEST:
+    if not -LARGEST <= low < high <= LARGEST or (log and low <= 0):
+        above = ", and above 0 on a logarithmic scale" * log
         raise ValueError(
             f"low={low} must be below high={high}, and both finite, at most {LARGEST:g} in size"
+            + above
         )
-    if log and low <= 0:
-        raise ValueError(f"low={low}: must be above 0 on a logarithmic scale")
     edges = torch.linspace(low, high, count + 1, dtype=torch.float64)
     if log:
         edges = torch.from_numpy(np.geomspace(low, high, count + 1))

@@ -5,7 +5,6 @@ A parameter is a continuous range, whole numbers, or choices; :func:`read_line` 
 """
 
 # Annotations are objects here, not texts: settings of other modules inherit the fields.
-import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -18,7 +17,15 @@ from annotated_types import Ge, Le, Len
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from proposer_rl.settings import ArgumentError, Positive, arguments, plain, settings, shown
+from proposer_rl.settings import (
+    ArgumentError,
+    Positive,
+    arguments,
+    plain,
+    settings,
+    shown,
+    within,
+)
 from proposer_rl.tasks.parameters import (
     MOST_BINS,
     SEED,
@@ -172,11 +179,11 @@ class Labelled(Bins):
 
 
 def choice_bins(values: list[Any], log: bool = False) -> Bins:
-    """Returns a bin for each of some rising numbers, or of whatever else there is to choose from.
+    """Returns a bin for each of some rising numbers, or for each choice of any other kind.
 
     Raises:
-        ValueError: for numbers that do not rise, or are too large; for a text or a truth value that
-            comes twice; for a logarithmic scale of what is not above 0.
+        ValueError: for numbers that do not rise or are too large, texts or truth values that occur
+            twice, or a logarithmic scale of anything but numbers above 0.
     """
     numbers = all(map(is_real, values))
     if log and not (numbers and values[0] > 0):
@@ -191,7 +198,7 @@ def choice_bins(values: list[Any], log: bool = False) -> Bins:
 
 
 def read_line(key: str, given: Any, count: int = 1) -> Bins:
-    """Returns the bins of what Python says of a parameter.
+    """Returns the bins of a parameter as Python describes it.
 
     Args:
         key: of the parameter, for errors.
@@ -201,14 +208,14 @@ def read_line(key: str, given: Any, count: int = 1) -> Bins:
         count: equal parts of a range.
 
     Raises:
-        ArgumentError: if it is nothing of that.
+        ArgumentError: if it is none of these.
     """
     given = python_values(given)
-    try:
+    with within(key, ValueError, OverflowError, lead=f"{key}={shown(given)}: "):
         if isinstance(given, Mapping):
             return LineSettings(**given).space_bins(count)
         if isinstance(given, range):
-            points(sorted({given.start, given.stop}))  # refuses what int64 cannot hold
+            points(sorted({given.start, given.stop}))  # refuses numbers beyond int64
         if isinstance(given, range) and given.step == 1 and len(given) > count:
             edges = torch.linspace(given.start, given.stop, count + 1, dtype=torch.float64)
             low = edges[:-1].ceil().long()
@@ -220,14 +227,10 @@ def read_line(key: str, given: Any, count: int = 1) -> Bins:
         if isinstance(given, list | range) and len(given):
             return choice_bins(list(given))
         raise ValueError("must be (low, high), a range or a list")
-    except ArgumentError as error:  # of an entry
-        raise ArgumentError(f"{key}.{error}") from error
-    except (ValueError, OverflowError) as error:
-        raise ArgumentError(f"{key}={shown(given)}: {error}") from error
 
 
 def read_part(key: str, given: Any, line: Bins) -> Bins:
-    """Returns a part of a parameter's line, of the type of its values.
+    """Returns a part of a parameter's line, in the type of its values.
 
     Args:
         key: of the part, for errors.
@@ -237,50 +240,39 @@ def read_part(key: str, given: Any, line: Bins) -> Bins:
         line: the parameter's.
 
     Raises:
-        ArgumentError: if it is none.
+        ArgumentError: if it is not a part of the line.
     """
     given = python_values(given)
     if isinstance(given, Mapping):
         law = normal_law if "distribution" in given else weighted_law
-        try:
+        with within(key):
             return law(line, **arguments(law, given, ("line",)))
-        except ArgumentError as error:
-            raise ArgumentError(f"{key}.{error}") from error
     if isinstance(line, Labelled):
         chosen = given if isinstance(given, list) and given not in line.labels else [given]
-        if not chosen or any(
-            value not in line.labels or chosen.count(value) > 1 for value in chosen
-        ):
+        if not chosen or any(one not in line.labels or chosen.count(one) > 1 for one in chosen):
             raise ArgumentError(f"{key}={given!r}: must be among {line.labels}, each once")
         places = torch.tensor(sorted(map(line.labels.index, chosen)))
         return replace(line, low=places, high=places)
     many = [given] if is_real(given) else given
-    if isinstance(many, list) and not all(map(is_real, many)):
-        raise ArgumentError(f"{key}={shown(given)}: must be a number, (from, to) or a list of them")
     part = read_line(key, many)
-    if not line.low.is_floating_point() and part.low.is_floating_point():
-        raise ArgumentError(
-            f"{key}={given}: must be whole, as the range is: one, a list or range(from, to + 1)"
-        )
-    part = Bins(part.low.to(line.low), part.high.to(line.high), log=part.log or line.log)
-    if part.log and part.low[0] <= 0:
-        raise ArgumentError(f"{key}={shown(given)}: must be above 0 on a logarithmic scale")
-    if not line.wide and (part.wide or not torch.isin(part.low, line.low).all()):
-        raise ArgumentError(f"{key}={given}: must be among {line.low.tolist()}")
+    log, fault = part.log or line.log, ""
+    if isinstance(part, Labelled):
+        fault = "must be a number, (from, to) or a list of them"
+    elif not line.low.is_floating_point() and part.low.is_floating_point():
+        fault = "must be whole, as the range is: one, a list or range(from, to + 1)"
+    elif log and part.low[0] <= 0:
+        fault = "must be above 0 on a logarithmic scale"
+    part = Bins(part.low.to(line.low), part.high.to(line.high), log=log)
+    if not (fault or line.wide) and (part.wide or not torch.isin(part.low, line.low).all()):
+        fault = f"must be among {line.low.tolist()}"
+    if fault:
+        raise ArgumentError(f"{key}={shown(given)}: {fault}")
     return part
 
 
 def target_in_file(target: Any, line: Bins) -> Any:
-    """Returns a target as Python has it: files have no tuples, and their ``[from, to]`` is one.
-
-    Raises:
-        ArgumentError: for another list in a range, which could be read in two ways.
-    """
-    if not line.wide or not isinstance(target, list) or len(target) == 1:
-        return target
-    if len(target) > 2:
-        raise ArgumentError(f"target={target}: must be a number or [from, to]")
-    return tuple(target)
+    """Returns a target as Python has it: files have no tuples, and their ``[from, to]`` is one."""
+    return tuple(target) if line.wide and isinstance(target, list) and len(target) == 2 else target
 
 
 def weighted_law(line: Bins, values: Annotated[list[Any], Len(1)], weights: list[Positive]) -> Law:
@@ -347,14 +339,10 @@ def spaces(
     """
     bins, target = {}, {}
     for name, given in parameters.items():
-        try:
+        with within(f"parameters.{name}", ValueError):
             if name in RESERVED or name.startswith("loss_"):
                 raise ValueError("is a column of training.csv; choose another name")
-            if not re.fullmatch(r"\w[\w .-]*", name):
-                raise ValueError("must be a name of letters, digits, spaces, dots and dashes")
             bins[name], target[name] = given.space_bins(), given.target_bins()
-        except ValueError as error:
-            raise ValueError(f"parameters.{name}: {error}") from error
         if inside(target[name], bins[name]) < 0.5:  # a typing error, or extrapolation
             warnings.warn(
                 f"parameters.{name}: most of the target, {target[name]}, lies outside of "

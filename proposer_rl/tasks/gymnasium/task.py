@@ -336,14 +336,11 @@ def _named(env_id: str, extra: str | None) -> Iterator[None]:
     """Puts the key before what is wrong with an environment, and says how to install a package."""
     try:
         yield
-    except (ImportError, gymnasium.error.DependencyNotInstalled) as error:
-        reason = " ".join(str(error).split())
-        how = f"; install it with: {install_command(extra)}" if extra else where_to_look(error)
-        raise ValueError(f"env_id={env_id}: {reason}{how}") from error
-    except gymnasium.error.Error as error:
-        unknown = isinstance(error, gymnasium.error.NameNotFound) and ":" not in env_id
-        own = "; name the module of your own one before it, as module:Name-v0" if unknown else ""
-        raise ValueError(f"env_id={env_id}: {str(error).rstrip('.')}{own}") from error
-    except UnfitEnvironmentError as error:
-        own_key = str(error).startswith(("success.", "parameters", "wrappers"))
-        raise ValueError(str(error) if own_key else f"env_id={env_id}: {error}") from error
+    except (ImportError, gymnasium.error.Error, UnfitEnvironmentError) as error:
+        said = " ".join(str(error).split()).rstrip(".")
+        if isinstance(error, ImportError | gymnasium.error.DependencyNotInstalled):
+            said += f"; install with: {install_command(extra)}" if extra else where_to_look(error)
+        elif isinstance(error, gymnasium.error.NameNotFound) and ":" not in env_id:
+            said += "; for your own environment, name its module first, as in module:Name-v0"
+        has_key = said.startswith(("success.", "parameters", "wrappers"))
+        raise ValueError(said if has_key else f"env_id={env_id}: {said}") from error

@@ -17,7 +17,7 @@ from torch import Tensor
 from proposer_rl.learning import in_first_episode
 from proposer_rl.runs.folder import storage
 from proposer_rl.runs.records import SampleRecord, checked, png
-from proposer_rl.task import named
+from proposer_rl.settings import within
 from proposer_rl.tasks.mazes.levels import FREE, Level, shortest_path_length
 
 SUFFIXES = (".txt", ".json", ".jsonl")  # the last is a run's record of what it trained on
@@ -156,17 +156,15 @@ def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict
     path = Path(path)
     with storage(path, "read"):
         content = path.read_bytes()
-
-    def levels() -> dict[str, Level]:
+    try:
         text = content.decode("utf-8-sig")  # some editors begin a file with a mark
         if path.suffix == ".json":
             return levels_from_json(text, kind)
         if path.suffix == ".jsonl":
             return levels_from_record(text, kind)
         return levels_from_text(text, path.stem, kind)
-
-    found: dict[str, Level] = named(str(path), levels)
-    return found
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def levels_from_text(
@@ -256,7 +254,8 @@ def _levels(drawn: Sequence[Item], kind: type[Level]) -> dict[str, Level]:
         where = f"level {item.name!r:.80}"
         if item.name in levels:
             raise ValueError(f"{where}: the name occurs twice")
-        level = levels[item.name] = named(where, kind.from_text, "\n".join(item.level))
+        with within(where, ValueError):
+            level = levels[item.name] = kind.from_text("\n".join(item.level))
         if item.path_length not in (None, length := int(shortest_path_length(level))):
             raise ValueError(
                 f"{where}: path_length is {item.path_length}, but the shortest path has {length} "

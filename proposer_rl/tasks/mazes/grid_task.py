@@ -15,7 +15,8 @@ from torch import Tensor
 
 from proposer_rl.learning import SolverSettings, first_episode_success
 from proposer_rl.models import ActorCritic, MapEncoder
-from proposer_rl.task import Board, ComputeContext, LevelResult, Task, check_distributions, named
+from proposer_rl.settings import within
+from proposer_rl.task import Board, ComputeContext, LevelResult, Task, check_distributions
 from proposer_rl.tasks.mazes.drawings import SETS, SUFFIXES, level_records, read_levels
 from proposer_rl.tasks.mazes.generation import edit_levels
 from proposer_rl.tasks.mazes.levels import Level, shortest_path_length
@@ -76,15 +77,17 @@ class GridTask(Task):
         self.device = torch.device(context.device)  # of what is made next
         self._kinds, self._target = dict(distributions), target
         self._encoder_channels = encoder_channels
+        with within("space", ValueError):
+            bins = self.make_space(space)
         rules = asdict(maze)
         rules.pop("observe_agent", None)
         super().__init__(
             distributions={
-                name: named(f"distributions.{name}", self.make_distribution, kind, *self.grid)
+                name: self._made(f"distributions.{name}", kind, *self.grid)
                 for name, kind in distributions.items()
             },
             target=target,
-            space=named("space", self.make_space, space),
+            space=bins,
             solver=solver,
             context=context,
             measured_on=evaluation.distributions,
@@ -176,6 +179,10 @@ class GridTask(Task):
             ValueError: naming the level.
         """
 
+    def _made(self, key: str, settings: Any, height: int, width: int) -> Any:
+        with within(key, ValueError):
+            return self.make_distribution(settings, height, width)
+
     def step_limit(self, steps: int, slack: int = STEPS_PER_SHORTEST) -> int:
         """Returns the step limit of a level, given the steps of its shortest way."""
         return max(self.maze.max_steps, slack * steps)
@@ -245,7 +252,7 @@ class GridTask(Task):
             else:  # the same levels and names however it was spelt
                 size = [int(cells) for cells in asked.group(2, 3)]
                 known = f"{known}@{size[0]}x{size[1]}"
-                grid = named(f"--levels {known}", self.make_distribution, kind, *size)
+                grid = self._made(f"--levels {known}", kind, *size)
                 levels = grid.sample(self._levels, self.stream("levels", known))
             return {f"{known}_{i:03}": levels[i].cpu() for i in range(len(levels))}, 0
         raise ValueError(

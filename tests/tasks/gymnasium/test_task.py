@@ -64,7 +64,6 @@ WRONG: list[tuple[dict[str, Any], str]] = [
      r"action space Box.*int64\): there is a policy for .* a Box of floats"),
     ({"env_id": "tests.tasks.gymnasium.broken:Walk-v0", "parameters": {}},
      r"env_id=.*: the constructor raises ZeroDiv.* \(broken.py, line \d+\), on the level"),
-    ({"parameters": {"a,b": PARAMETERS["width"]}}, "parameters.a,b: must be a name of letters"),
     ({"wrappers": ["nowhere.Wrapper"]}, "wrappers: nowhere.Wrapper: .*cannot be imported"),
     ({"arguments": {"foo": 1}}, "env_id=.*: the constructor raises TypeError: .*unexpected"),
     ({"env_id": f"{HERE}:Grown-v0", "parameters": {"size": SIZES}},
