@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from gymnasium import register
 
-from proposer_rl.tasks.mazes.distributions import LevelDistribution, SpecificationSpace
 from proposer_rl.tasks.mazes.drawings import draw_level
-from proposer_rl.tasks.mazes.generation import MECHANISMS, generate_levels
+from proposer_rl.tasks.mazes.generation import (
+    MECHANISMS,
+    LevelDistribution,
+    SpecificationSpace,
+    generate_levels,
+)
 from proposer_rl.tasks.mazes.levels import (
     Level,
     LevelSpec,

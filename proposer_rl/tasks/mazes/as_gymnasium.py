@@ -13,7 +13,7 @@ from gymnasium.error import ResetNeeded
 from tensordict import TensorDictBase
 
 from proposer_rl.settings import ArgumentError, checked
-from proposer_rl.tasks.mazes.distributions import SpecificationSpace
+from proposer_rl.tasks.mazes.generation import SpecificationSpace
 from proposer_rl.tasks.mazes.levels import MOVES, Level, validate_levels
 from proposer_rl.tasks.mazes.maze_env import MazeEnv
 from proposer_rl.tasks.mazes.task import Fractions, MazeSettings, Mechanism, PathLengths
@@ -93,7 +93,7 @@ class SingleMaze(gymnasium.Env[Any, Any]):
         """Begins an episode.
 
         Raises:
-            ValueError: if the level in the options is none of this grid.
+            ValueError, RuntimeError: if the level in the options is none of this grid.
         """
         given = self._read(options["level"]) if options else None
         super().reset(seed=seed)

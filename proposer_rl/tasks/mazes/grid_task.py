@@ -17,7 +17,15 @@ from proposer_rl.learning import SolverSettings, first_episode_success
 from proposer_rl.models import ActorCritic, MapEncoder
 from proposer_rl.settings import within
 from proposer_rl.task import Board, ComputeContext, LevelResult, Task, check_distributions
-from proposer_rl.tasks.mazes.drawings import SETS, SUFFIXES, level_records, read_levels
+from proposer_rl.tasks.mazes.drawings import (
+    SETS,
+    SUFFIXES,
+    level_records,
+    levels_from_text,
+    levels_to_text,
+    read_levels,
+    recorded_drawing,
+)
 from proposer_rl.tasks.mazes.generation import edit_levels
 from proposer_rl.tasks.mazes.levels import Level, shortest_path_length
 
@@ -260,6 +268,46 @@ class GridTask(Task):
             f"{' or '.join(SUFFIXES)}, or a distribution: {', '.join(self._kinds)}, as it is "
             f"or on another grid as in {self._target}@13x13"
         )
+
+
+class Drawings:
+    """Reads and draws mazes: a :class:`~proposer_rl.task.Board` but for what a Solver does.
+
+    Args:
+        task: whose levels are drawn.
+    """
+
+    sets = tuple(SETS)
+
+    def __init__(self, task: GridTask) -> None:
+        self._task = task
+        self.size = task.grid
+
+    def read(self, rows: Sequence[str]) -> Any:
+        """Returns the level that is drawn; see :class:`~proposer_rl.task.Board`."""
+        level = self._task.level.from_text("\n".join(rows))
+        self._task.check_level("drawn", level)
+        return level
+
+    def draw(self, level: Level) -> list[str]:
+        """Returns the rows of a level's drawing."""
+        return str(level.to_text()).splitlines()
+
+    def drawing(self, record: Mapping[str, Any]) -> list[str]:
+        """Returns the rows of a record's level, without the Solver's path."""
+        return recorded_drawing(record["text"])
+
+    def level_set(self, name: str) -> Mapping[str, Level]:
+        """Returns the levels of a shipped set; an agent that turns looks to the right."""
+        return read_levels(SETS[name], self._task.level)
+
+    def read_file(self, text: str) -> Mapping[str, Level]:
+        """Returns the levels of a file's text; docs/how_to/levels.md has the format."""
+        return levels_from_text(text, kind=self._task.level)
+
+    def write_file(self, name: str, level: Level) -> str:
+        """Returns a file's text; docs/how_to/levels.md has the format."""
+        return levels_to_text({name: level})
 
 
 def _moments(values: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:

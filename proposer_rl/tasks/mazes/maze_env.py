@@ -82,18 +82,8 @@ class LevelEnv(EnvBase):
         """Replaces the levels; each maze plays its new one from its own next reset on.
 
         Args:
-            levels: Levels of the environment's batch shape, grid and device.
-
-        Raises:
-            ValueError: If they differ in batch shape, grid or device.
+            levels: Levels of the environment's batch shape and grid.
         """
-        given = (levels.batch_size, levels.walls.shape[-2:], levels.walls.device)
-        own = (self.batch_size, self._grid, self._levels.walls.device)
-        if given != own:
-            raise ValueError(
-                "levels must keep the environment's batch shape, grid and device "
-                f"{_describe(*own)}, got {_describe(*given)}"
-            )
         self._next_levels.update_(levels)
         self._waiting = True
 
@@ -200,10 +190,6 @@ class LevelEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """Does nothing: the environment draws nothing at random."""
-
-
-def _describe(batch: torch.Size, grid: torch.Size, device: torch.device) -> str:
-    return f"{list(batch)}, {grid[0]}x{grid[1]}, {device}"
 
 
 @signed

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Ge, Interval, Len
@@ -12,24 +12,46 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning import SolverSettings
-from proposer_rl.models import ActorCritic, Population, UNet, cell_logits, map_actor_critic
+from proposer_rl.models import (
+    ActorCritic,
+    Population,
+    UNet,
+    cell_logits,
+    cell_maps,
+    map_actor_critic,
+)
 from proposer_rl.settings import settings
-from proposer_rl.task import ComputeContext, LevelResult, for_copies
-from proposer_rl.tasks.mazes.board import MazeBoard
-from proposer_rl.tasks.mazes.distributions import LevelDistribution, SpecificationSpace
+from proposer_rl.task import CellKind, ComputeContext, LevelResult, for_copies
 from proposer_rl.tasks.mazes.drawings import EPISODE
 from proposer_rl.tasks.mazes.evaluation import (
     ExactEvaluator,
     RolloutEvaluator,
+    expected_visits,
     optimal_return,
+    policy_path,
+    success_from_cells,
     worst_mean,
 )
-from proposer_rl.tasks.mazes.grid_task import GridTask
-from proposer_rl.tasks.mazes.levels import Level, planes, shortest_path_length
+from proposer_rl.tasks.mazes.generation import LevelDistribution, SpecificationSpace
+from proposer_rl.tasks.mazes.grid_task import Drawings, GridTask
+from proposer_rl.tasks.mazes.levels import (
+    FREE,
+    GOAL,
+    START,
+    WALL,
+    Level,
+    cell_index,
+    cell_plane,
+    planes,
+    shortest_path_length,
+    shortest_way,
+    successors,
+)
 from proposer_rl.tasks.mazes.maze_env import MazeEnv
 
 ACTIONS = 4
 PLANES = 3
+DIGITS = 4  # of the numbers on a board: what can be seen
 WORST = 0.1  # of the levels, in <name>_success_worst10
 CELLS_AT_ONCE = 2**17  # that go through the network together
 
@@ -302,6 +324,93 @@ class MazeTask(GridTask):
             for i, (name, known) in enumerate(about.items()):
                 results = {key: float(value[k, i]) for key, value in performance.items()}
                 yield LevelResult(name, k, known, results)
+
+
+class MazeBoard(Drawings):
+    """Mazes that are seen whole; a :class:`~proposer_rl.task.Board`."""
+
+    kinds = (
+        CellKind(FREE, "free"),
+        CellKind(WALL, "wall"),
+        CellKind(START, "start", once=True),
+        CellKind(GOAL, "goal", once=True),
+    )
+    actions = ("up", "down", "left", "right")
+
+    @torch.no_grad()
+    def examine(
+        self, agent: ActorCritic, solver: int, level: Level, max_steps: int | None
+    ) -> dict[str, Any]:
+        """Returns what a Solver does on a level, exactly; see :class:`~proposer_rl.task.Board`.
+
+        ``results``: ``success``, ``return`` and ``steps`` (expected) of the sampled policy.
+        ``maps``: the critic's values; the probability of success from every cell with the whole
+        step limit; how often a step of an episode begins there.
+        """
+        shortest = shortest_path(level)
+        steps, step_penalty = len(shortest or [0]) - 1, self._task.maze.step_penalty
+        limit = max_steps or self._task.step_limit(steps)
+        level = level.to(self._task.device)
+        copies = planes(level.expand(agent.copies, 1))
+        logits, values = (each[solver, 0] for each in cell_maps(agent, copies))
+        logits, values = logits.float(), values[0].float()
+        policy = logits.softmax(0)
+        visits = expected_visits(level, policy, limit)
+        results = ExactEvaluator(limit, step_penalty)(level, logits)
+        goal = cell_plane(level.goal, level.walls.shape).bool()
+        maps = {
+            "critic's value": (values, level.walls | goal),
+            "success from here": (success_from_cells(level, policy, limit), level.walls),
+            "expected visits": (visits, level.walls),
+        }
+        path = policy_path(level, logits, limit).tolist()
+        return {
+            "results": {
+                "success": float(results["success"]),
+                "return": float(results["return"]),
+                "steps": float(visits.sum()),
+            },
+            "policy": _numbers(policy, level.walls | goal),
+            "maps": {name: _numbers(*values) for name, values in maps.items()},
+            "paths": {"solver": _until_it_ends(path, level.goal.tolist()), "shortest": shortest},
+            "next": successors(level).tolist(),
+            "goal": level.goal.tolist(),
+            "max_steps": limit,
+            "step_penalty": step_penalty,
+            "missed": -step_penalty * limit,
+        }
+
+
+def shortest_path(level: Level) -> list[list[int]] | None:
+    """Returns a shortest path of a level ``[]``: its cells (row, column), start to goal.
+
+    Returns:
+        Of several the one whose moves come first in
+        :data:`~proposer_rl.tasks.mazes.levels.MOVES`; None where there is no path.
+    """
+    width = level.walls.shape[1]
+    start, goal = (int(cell_index(cell, width)) for cell in (level.start, level.goal))
+    path = shortest_way(successors(level).tolist(), start, lambda cell: cell == goal)
+    return None if path is None else [list(divmod(cell, width)) for cell in path]
+
+
+def _until_it_ends(path: list[list[int]], goal: list[int]) -> list[list[int]]:
+    """Returns a path up to the goal, or to the first cell that is entered again."""
+    seen: set[tuple[int, ...]] = set()
+    for length, cell in enumerate(path, 1):
+        if cell == goal or tuple(cell) in seen:
+            return path[:length]
+        seen.add(tuple(cell))
+    return path
+
+
+def _numbers(values: Tensor, without: Tensor) -> list[list[Any]]:
+    """Returns values ``[*A, H, W]`` as lists [H][W][*A]; None in cells of ``without``."""
+    rows = values.movedim((-2, -1), (0, 1)).double().round(decimals=DIGITS).tolist()
+    return [
+        [None if left_out else value for value, left_out in zip(row, line, strict=True)]
+        for row, line in zip(rows, without.tolist(), strict=True)
+    ]
 
 
 def _with_logits(agent: ActorCritic, levels: Level) -> tuple[Level, Tensor]:

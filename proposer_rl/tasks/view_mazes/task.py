@@ -17,8 +17,7 @@ from proposer_rl.models import ActorCritic, MemoryNetwork
 from proposer_rl.settings import settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import CellKind, ComputeContext, LevelResult, for_copies
-from proposer_rl.tasks.mazes.board import Drawings
-from proposer_rl.tasks.mazes.grid_task import GridTask
+from proposer_rl.tasks.mazes.grid_task import Drawings, GridTask
 from proposer_rl.tasks.mazes.levels import (
     FREE,
     GOAL,
