@@ -18,7 +18,7 @@ from proposer_rl.models import check_torch_defaults, population
 from proposer_rl.settings import ArgumentError, signed, within
 from proposer_rl.task import ComputeContext, Levels, Task
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings, solver_network
-from proposer_rl.tasks.gymnasium.player import imported
+from proposer_rl.tasks.gymnasium.player import import_object
 from proposer_rl.tasks.parameters import SEED
 from proposer_rl.tasks.ranges import RangeSettings, spaces
 
@@ -335,7 +335,7 @@ class BatchedTask(Task):
 
 def _environment_class(name: str) -> type[BatchedEnv]:
     with within("env", ValueError):
-        kind: Any = imported(name)
+        kind: Any = import_object(name)
     if not (isinstance(kind, type) and issubclass(kind, BatchedEnv)):
         raise ArgumentError(f"env={name!r}: must be a subclass of BatchedEnv")
     return kind

@@ -16,7 +16,7 @@ from proposer_rl.tasks.gymnasium.environment import (
     as_number,
     entries,
     mismatch,
-    stepped,
+    read_step,
     write_attribute,
 )
 from proposer_rl.tasks.parameters import SEED
@@ -120,7 +120,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Makes a step; after the last one of an episode the teacher gets return and success."""
         self._require_own()
         try:
-            answer = stepped(self.env.step(action))
+            answer = read_step(self.env.step(action))
         except UnfitEnvironmentError as error:
             raise ArgumentError(f"env: {error}") from error
         observation, reward, terminated, truncated, info = answer

@@ -154,7 +154,7 @@ def _numbers(environment: Any) -> list[str]:
     )
 
 
-def stepped(result: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+def read_step(result: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
     """Returns a step's result with the reward as a float and the ends as truth values.
 
     Raises:

@@ -1,4 +1,4 @@
-"""One environment of Gymnasium that plays the levels that it is given."""
+"""Makes a Gymnasium environment and plays levels in it."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ from proposer_rl.tasks.gymnasium.environment import (
     SuccessSettings,
     UnfitEnvironmentError,
     mismatch,
-    stepped,
+    read_step,
     write_attribute,
 )
-from proposer_rl.tasks.gymnasium.spaces import Layout, typed
+from proposer_rl.tasks.gymnasium.spaces import Layout, cast_to
 from proposer_rl.tasks.parameters import MOST_BINS, SEED
 from proposer_rl.tasks.ranges import RangeSettings, value_text
 
-# The dotted name of a function or class, or that with its further arguments by name.
+# The dotted name of a function or class; or a mapping from it to its further arguments.
 WrapperSettings = str | Annotated[dict[str, dict[str, Any]], Len(1, 1)]
 
 
 @settings
 class ParameterSettings(RangeSettings):
-    """A parameter of the environment that differs between levels: a number, a text or the like.
+    """Settings of a parameter that differs between levels: a number, a text, a list or the like.
 
     Attributes:
-        values: rising numbers; or texts, truth values, lists, each of which is set as it is.
-        set: how it gets into the environment, before each reset: as an attribute, as an argument
-            of the constructor (the environment is then built anew where it changes), as an option
-            of the reset, or by a function that is called with the environment and the value.
+        values: rising numbers; or texts, truth values or lists, which are set as they are.
+        set: how the environment gets the value before each reset: as an attribute; as an argument
+            of its constructor, which is called again when the value changes; as an option of the
+            reset; or by a function, called with the environment and the value.
         name: of the attribute (dots lead to parts of the environment, numbers to elements),
-            argument, option or function (which must be given), or of several that all get the
-            value; None for the parameter's own name.
-        to: what the environment gets for each of ``values``, which are then numbers that say how
-            they are ordered and how far apart they are.
+            argument, option or function, or several names that all get the value; None for the
+            parameter's own name.
+        to: what the environment gets in place of each of ``values``, which are then numbers that
+            only order the choices.
     """
 
     values: Annotated[list[Any], Len(1, MOST_BINS)] | None = None
@@ -59,21 +59,21 @@ class ParameterSettings(RangeSettings):
             raise ValueError(f"to={self.to}: must be one for each of values={self.values}")
 
     def names(self, own: str) -> list[str]:
-        """Returns the names that get the value of the parameter, whose own name is given."""
+        """Returns the names that get the value of a parameter with this own name."""
         name = own if self.name is None else self.name
         return [name] if isinstance(name, str) else name
 
     def given(self, value: Any) -> Any:
-        """Returns what the environment gets for a value, a copy that it may change."""
+        """Returns what the environment gets for a value, as a copy that it may change."""
         return deepcopy(value if self.to is None else self.to[(self.values or []).index(value)])
 
 
 @dataclass(frozen=True)
 class MakeEnvironment:
-    """Makes an environment; can be sent to another process.
+    """Makes an environment when it is called, also in another process.
 
     Attributes:
-        env_id, arguments, max_steps, wrappers: as of
+        env_id, arguments, max_steps, wrappers: as in
             :class:`~proposer_rl.tasks.gymnasium.task.GymnasiumTask`.
     """
 
@@ -97,45 +97,46 @@ class MakeEnvironment:
         for wrapper in self.wrappers:
             ((name, given),) = ({wrapper: {}} if isinstance(wrapper, str) else wrapper).items()
             try:
-                env = imported(name)(env, **given)
+                env = import_object(name)(env, **given)
             except Exception as error:
                 raise UnfitEnvironmentError(f"wrappers: {name}: {cause(error)}") from error
         return env
 
 
 class GymLevel(NamedTuple):
-    """A level: values of the parameters by name, and the seed of every reset."""
+    """A level: the parameters' values by name, and the seed of every reset."""
 
     values: Mapping[str, Any]
     seed: int
 
     @property
     def lines(self) -> list[str]:
-        """Returns the parameters' values in lines, as they are shown."""
+        """Returns a line of text for each parameter."""
         return [f"{name} {value_text(value, 4)}" for name, value in self.values.items()]
 
     def __str__(self) -> str:
-        """Returns the level as a text."""
+        """Returns the level in one line, with the seed."""
         values = [f"{name}={value_text(value)}" for name, value in self.values.items()]
         return ", ".join([*values, f"{SEED}={self.seed}"])
 
 
 class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An environment whose resets set up the level that it plays.
+    """Sets an environment up for a level at every reset.
 
-    An info has ``success`` alone, where a step ended an episode that is one.
+    Its info is empty but for ``success`` at the end of a successful episode.
 
     Args:
-        make, parameters: the environment, and what differs between levels, by name.
+        make: makes the environment.
+        parameters: what differs between levels, by name.
         play: the first level.
-        success: when an episode is one; None where nobody asks.
-        once: stand still after the first episode of a level, for evaluations.
+        success: when an episode is a success; None to leave that out.
+        once: whether to play one episode of a level and then stand still, for evaluations.
 
     Attributes:
-        last_info: that of the last reset or step.
+        last_info: the environment's own info of the last reset or step.
     """
 
-    _seen: Any  # at last
+    _seen: Any  # the last observation
 
     def __init__(
         self,
@@ -158,7 +159,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     @property
     def play(self) -> GymLevel:
-        """Returns what is played from the next reset on."""
+        """Returns the level that is played from the next reset on."""
         return self._play
 
     @play.setter
@@ -167,12 +168,12 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     @cached_property
     def layout(self) -> Layout:
-        """Returns how a Solver sees the environment and acts in it."""
+        """Returns the conversion between the environment's spaces and a Solver's tensors."""
         return Layout(self.observation_space, self.action_space)
 
     @property
     def in_time(self) -> bool:
-        """Returns whether no time limit is reached, each counting the steps that it has seen."""
+        """Returns whether no wrapper has reached its time limit."""
         return all(
             (limit._elapsed_steps or 0) < limit._max_episode_steps
             for limit in time_limits(self.env)
@@ -192,7 +193,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             seen, self.last_info = self.env.reset(
                 seed=self._play.seed, **({"options": given} if given else {})
             )
-            self._seen = typed(self.observation_space, seen)
+            self._seen = cast_to(self.observation_space, seen)
         except Exception as error:
             raise self._fault("reset", error) from error
         return self._seen, {}
@@ -203,9 +204,9 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             return self._seen, 0.0, False, False, {}
         rule = self._success
         try:
-            answer = stepped(self.env.step(action))
+            answer = read_step(self.env.step(action))
             seen, reward, terminated, truncated, self.last_info = answer
-            self._seen = typed(self.observation_space, seen)
+            self._seen = cast_to(self.observation_space, seen)
             self._return += reward
             over = terminated or truncated
             if rule is not None and (over or rule.once):
@@ -217,7 +218,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._seen, reward, terminated, truncated, info
 
     def mismatches(self) -> str | None:
-        """Describes in a line an attribute that no longer has the level's value; None for none."""
+        """Describes an attribute that does not have the level's value in a line; None for none."""
         for name, how, path in self._ways:
             line = how == "attribute" and mismatch(self.env, path, self._value(name))
             if line:
@@ -234,7 +235,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
                 if how == "attribute":
                     write_attribute(inner, path, self._value(name))
                 elif how == "call":
-                    imported(path)(inner, self._value(name))
+                    import_object(path)(inner, self._value(name))
             except Exception as error:
                 raise UnfitEnvironmentError(f"parameters.{name}: {cause(error)}") from error
 
@@ -248,31 +249,31 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             raise self._fault("the constructor", error) from error
 
     def _named(self, way: str) -> dict[str, Any]:
-        """Returns the values that are set in one way, by the names that they have there."""
+        """Returns the values that are set in one way, by the names to which they go."""
         return {name: self._value(parameter) for parameter, how, name in self._ways if how == way}
 
     def _value(self, parameter: str) -> Any:
         return self.parameters[parameter].given(self._play.values[parameter])
 
     def _fault(self, doing: str, error: Exception) -> UnfitEnvironmentError:
-        """Returns what an environment raises, whatever that is, as an error with the level."""
+        """Returns an exception of the environment as an error that names the level."""
         raises = "" if isinstance(error, UnfitEnvironmentError) else f"{doing} raises "
         return UnfitEnvironmentError(f"{raises}{cause(error)}, on the level {self._play}")
 
 
 def time_limits(env: Any) -> Iterator[TimeLimit]:
-    """Yields the wrappers of an environment that limit its episodes' steps."""
+    """Yields the wrappers that limit the steps of an environment's episodes."""
     while isinstance(env, gymnasium.Wrapper):
         if isinstance(env, TimeLimit):
             yield env
         env = env.env
 
 
-def imported(name: str) -> Any:
-    """Returns what has a dotted name, and imports its module.
+def import_object(name: str) -> Any:
+    """Imports a function or class by its dotted name.
 
     Raises:
-        UnfitEnvironmentError: if there is no such thing.
+        UnfitEnvironmentError: if there is none.
     """
     try:
         return resolve_name(name)
@@ -281,7 +282,7 @@ def imported(name: str) -> Any:
 
 
 def cause(error: Exception) -> str:
-    """Returns an exception as part of a line, with the place that raised it unless it is ours."""
+    """Returns an exception in one line, with the file and line that raised it unless it is ours."""
     if isinstance(error, UnfitEnvironmentError):
         return str(error)
     *_, last = traceback.extract_tb(error.__traceback__)

@@ -1,4 +1,4 @@
-"""A trial before anything is trained: Gymnasium's check, wrappers, levels and successes."""
+"""Tries an environment before training: Gymnasium's check, wrappers, levels and successes."""
 
 from __future__ import annotations
 
@@ -25,29 +25,27 @@ from proposer_rl.tasks.parameters import Bins
 from proposer_rl.tasks.ranges import Labelled, value_text
 
 SHORT = 64  # steps of an episode in which levels are compared
-RESETS = 3  # after which a level must still be there
-# What Gymnasium advises on boxes, whose actions are scaled here anyway.
+RESETS = 3  # after each of which a parameter must have its value
+# Gymnasium's advice on the bounds of boxes, to which actions are scaled here anyway.
 ADVICE = r"(?s).*(A Box .* space m\w+ value is|For Box action spaces)"
 
 
-def tried(
+def check_environment(
     make: MakeEnvironment,
     parameters: Mapping[str, ParameterSettings],
     bins: Mapping[str, Bins],
     target: GymLevel,
     success: SuccessSettings,
 ) -> int:
-    """Plays an episode on a level of the target, and short ones at both ends of each parameter.
+    """Checks an environment by playing it, and returns the step limit of its episodes.
 
-    At the ends of a parameter's bins all others are as in the target. Where it gets texts or
-    the like, each is tried. What Gymnasium's ``check_env`` finds is a warning.
-
-    Returns:
-        Steps of an episode at most.
+    It plays one episode on a level of the target, and short ones at both ends of each parameter,
+    with all others as in the target; of texts and the like it plays every choice. What Gymnasium's
+    ``check_env`` finds is a warning.
 
     Raises:
-        ValueError: in a line that names the key, for what cannot be made, set or read.
-        ImportError, gymnasium.error.Error: of the environment, if it cannot be made.
+        ValueError: in a line that names the setting, if something cannot be made, set or read.
+        ImportError, gymnasium.error.Error: from the environment, if it cannot be made.
     """
     _check_interface(LevelPlayer(make, parameters, target))
     _check_wrappers(make, parameters, target)
@@ -67,7 +65,7 @@ def tried(
 
 
 def _check_interface(player: LevelPlayer) -> None:
-    """Lets Gymnasium check the environment; what it finds is a warning and no refusal."""
+    """Runs Gymnasium's own check, and warns of what it finds."""
     player.reset()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ADVICE)
@@ -85,10 +83,10 @@ def _check_interface(player: LevelPlayer) -> None:
 def _check_wrappers(
     make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: GymLevel
 ) -> None:
-    """Refuses wrappers with which a level plays differently the second time, if it did not before.
+    """Checks that the same actions on the same level have the same results a second time.
 
     Raises:
-        ValueError: if one keeps running statistics or draws numbers of its own.
+        ValueError: naming the wrapper from which on they have not.
     """
     for count in range(len(make.wrappers) + 1 if make.wrappers else 0):
         player = LevelPlayer(replace(make, wrappers=make.wrappers[:count]), parameters, play)
@@ -101,21 +99,20 @@ def _check_wrappers(
         return
     if count:
         raise ValueError(
-            f"wrappers: {make.wrappers[count - 1]}: with it the same actions on the same level end "
-            "otherwise the second time: it keeps running statistics or draws numbers without the "
-            "seed. Use PPO's normalize_observations and normalize_rewards, which all environments "
-            "share"
+            f"wrappers: {make.wrappers[count - 1]}: with it the same actions on the same level can "
+            "have other results the second time: it keeps running statistics, or draws numbers "
+            "without the seed. To normalize, use PPO's normalize_observations and normalize_rewards"
         )
 
 
 def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) -> None:
-    """Plays one episode to its end, which must tell whether it was a success."""
+    """Plays one episode to its end, where the rule of success must find what it needs."""
     steps = list(_played(player, limit + 1))
     if success.kind == "survived" and steps[-1].truncated and player.in_time:
         warnings.warn(
             f"success.kind=survived: the environment cut an episode off after {len(steps)} steps, "
-            f"before the time limit of {limit}, which does not count as survival; if that is its "
-            "own time limit, set max_steps to it",
+            f"before the time limit of {limit}, which is no success; if it has a time limit of its "
+            "own, set max_steps to that",
             stacklevel=2,
         )
 
@@ -130,8 +127,8 @@ def _check_values(player: LevelPlayer, name: str, plays: list[GymLevel]) -> None
             next(_played(player, 1))
             if (line := player.mismatches()) is not None:
                 raise ValueError(
-                    f"{line}, after a reset and a step: the environment sets it by itself; set it "
-                    "in another way, such as set: option or set: call"
+                    f"{line}, after a reset and a step: the environment overwrites it; set it in "
+                    "another way, such as set: option or set: call"
                 )
         player.play = play
         episodes.append(list(_played(player, SHORT)))
@@ -153,7 +150,7 @@ def _check_values(player: LevelPlayer, name: str, plays: list[GymLevel]) -> None
 
 
 def _look_alike(player: LevelPlayer, ends: Sequence[GymLevel]) -> bool:
-    """Returns whether no picture tells levels apart; it may take skill to meet what differs."""
+    """Returns whether pictures show no difference; it may take skill to meet what differs."""
     camera = Camera(player.make, player.parameters, ends[0])
     first, last = (camera.picture(play, None) for play in ends)
     return not camera.works or np.array_equal(first, last)

@@ -218,11 +218,11 @@ def test_what_is_only_passed_on_is_not_set_beside_it() -> None:
     [
         (
             "gymnasium.wrappers.NormalizeObservation",
-            "with it the same actions .* keeps running statistics",
+            "with it the same actions .* keeps running stat",
         ),
         (
             "gymnasium.wrappers.NormalizeReward",
-            "with it the same actions .* keeps running statistics",
+            "with it the same actions .* keeps running stat",
         ),
         ("gymnasium.wrappers.FilterObservation", "TypeError: .*filter_keys"),
     ],
