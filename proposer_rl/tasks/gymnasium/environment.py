@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from numbers import Number
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -195,24 +195,6 @@ def entries(info: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, An
             yield from entries(value, f"{within}{name}.")
 
 
-class Step(NamedTuple):
-    """A step that may tell whether its episode is a success.
-
-    Attributes:
-        terminated: whether the environment ended the episode.
-        truncated: whether it was cut off.
-        in_time: whether the time limit had not been reached.
-        returns: sum of the episode's rewards.
-        info: of the environment.
-    """
-
-    terminated: bool
-    truncated: bool
-    in_time: bool
-    returns: float
-    info: Mapping[str, Any]
-
-
 @settings
 class SuccessSettings:
     """Decides when an episode is a success.
@@ -239,27 +221,40 @@ class SuccessSettings:
         if needed and getattr(self, needed) is None:
             raise ArgumentError(f"{needed}: missing with kind={self.kind}")
 
-    def __call__(self, step: Step) -> bool:
+    def __call__(
+        self,
+        terminated: bool,
+        truncated: bool,
+        in_time: bool,
+        returns: float,
+        info: Mapping[str, Any],
+    ) -> bool:
         """Returns whether an episode with this last step, or with ``once`` any step, is a success.
+
+        Args:
+            terminated: whether the environment ended the episode.
+            truncated: whether it was cut off.
+            in_time: whether the time limit had not been reached.
+            returns: sum of the episode's rewards.
+            info: of the environment.
 
         Raises:
             UnfitEnvironmentError: if the entry is not a truth value, or an episode's last info has
-                no such entry, with those that there are.
+                no such entry, listing those that there are.
         """
         if self.kind == "return":
             least = self.least or 0.0
-            return step.returns >= least or math.isclose(step.returns, least, rel_tol=ROUNDING)
+            return returns >= least or math.isclose(returns, least, rel_tol=ROUNDING)
         if self.kind == "survived":
-            return not step.terminated and not step.in_time
+            return not terminated and not in_time
         if self.kind == "terminated":
-            return step.terminated
-        known = dict(entries(step.info))
+            return terminated
+        known = dict(entries(info))
         value = known.get(self.key or "")
         if value is not None:
-            return bool(
-                as_number(value, f"success.key={self.key}: the entry of the info", flag=True)
-            )
-        if not self.optional and (step.terminated or step.truncated):
+            what = f"success.key={self.key}: the entry of the info"
+            return bool(as_number(value, what, flag=True))
+        if not self.optional and (terminated or truncated):
             raise UnfitEnvironmentError(
                 f"success.key={self.key}: the last info of an episode has no such entry; it has: "
                 f"{', '.join(known) or 'none'}; where only episodes that succeed have it, set "

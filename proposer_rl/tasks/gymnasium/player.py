@@ -17,7 +17,6 @@ from gymnasium.wrappers import TimeLimit
 
 from proposer_rl.settings import settings
 from proposer_rl.tasks.gymnasium.environment import (
-    Step,
     SuccessSettings,
     UnfitEnvironmentError,
     mismatch,
@@ -131,9 +130,6 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         play: the first level.
         success: when an episode is a success; None to leave that out.
         once: whether to play one episode of a level and then stand still, for evaluations.
-
-    Attributes:
-        last_info: the environment's own info of the last reset or step.
     """
 
     _seen: Any  # the last observation
@@ -155,7 +151,6 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         ]
         self.play = play
         super().__init__(self._built())
-        self.last_info: Mapping[str, Any] = {}
 
     @property
     def play(self) -> GymLevel:
@@ -190,9 +185,7 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._set_up()
         given = self._named("option")
         try:
-            seen, self.last_info = self.env.reset(
-                seed=self._play.seed, **({"options": given} if given else {})
-            )
+            seen, _ = self.env.reset(seed=self._play.seed, **({"options": given} if given else {}))
             self._seen = cast_to(self.observation_space, seen)
         except Exception as error:
             raise self._fault("reset", error) from error
@@ -205,17 +198,17 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
         rule = self._success
         try:
             answer = read_step(self.env.step(action))
-            seen, reward, terminated, truncated, self.last_info = answer
+            seen, reward, terminated, truncated, info = answer
             self._seen = cast_to(self.observation_space, seen)
             self._return += reward
             over = terminated or truncated
             if rule is not None and (over or rule.once):
-                step = Step(terminated, truncated, self.in_time, self._return, self.last_info)
-                self._succeeded = rule(step) or self._succeeded
+                ends = terminated, truncated, self.in_time
+                self._succeeded |= rule(*ends, self._return, info)
         except Exception as error:
             raise self._fault("step", error) from error
-        info = {"success": True} if over and self._succeeded else {}
-        return self._seen, reward, terminated, truncated, info
+        told = {"success": True} if over and self._succeeded else {}
+        return self._seen, reward, terminated, truncated, told
 
     def mismatches(self) -> str | None:
         """Describes an attribute that does not have the level's value in a line; None for none."""
