@@ -1,4 +1,4 @@
-"""Tasks: what they are made of, and the base of all."""
+"""The base of tasks, and the interfaces of their parts."""
 
 from proposer_rl.task.base import Task as Task
 from proposer_rl.task.protocols import Board as Board

@@ -192,7 +192,7 @@ def test_a_target_beyond_the_range_is_told(target: Any, outside: bool) -> None:
         warnings.simplefilter("always")
         spaces({"mass": ParameterSettings(**RANGE, target=target)})
     assert len(told) == outside
-    assert all("lies outside of low=0 to high=3, which" in str(one.message) for one in told)
+    assert all("lies outside of low=0 to high=3, from which" in str(one.message) for one in told)
 
 
 def test_without_parameters_levels_lie_along_no_axis() -> None:
