@@ -16,7 +16,7 @@ from proposer_rl.learning import PPO
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 from proposer_rl.tasks.mazes import Level, SpecificationSpace
-from proposer_rl.tasks.mazes.distributions import LevelDistribution
+from proposer_rl.tasks.mazes.generation import LevelDistribution
 from tests.meta import test_first_order as exact
 
 BINS, P = 6, 16
