@@ -12,7 +12,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from proposer_rl.cli.config import RunConfig, read_config
-from proposer_rl.cli.groups import Invocation, check_groups, python_path
+from proposer_rl.cli.groups import Invocation, check_scale, python_path
 from proposer_rl.cli.run import carry_out
 from proposer_rl.cli.watch import show_run
 from proposer_rl.recipes import composed, plain_values, storable
@@ -37,7 +37,7 @@ def compose_and_run(
         ArgumentError: naming the first wrong key, its value and what is allowed.
         Interrupted: if a signal asked the run to stop; all is saved then.
     """
-    check_groups(words)
+    check_scale(words)
     own = [{key: storable(key, value) for key, value in some.items()} for some in settings]
     config = read_config(composed(words, *own))
     asked = plain_values(OmegaConf.merge({}, *own))

@@ -22,12 +22,12 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from proposer_rl.cli.errors import UNFORESEEN, ConfigError, command, exit_code, one_line, refuse
-from proposer_rl.cli.groups import arranged, check_chosen, check_groups, invocation, quoted
+from proposer_rl.cli.groups import arranged, check_chosen, check_scale, invocation
 from proposer_rl.recipes import CONFIG_FOLDER, composed, explained, plain_values
 from proposer_rl.runs.folder import FAILURE, RunFolder
 from proposer_rl.runs.process import InUseError, StopSignals, guard_output
@@ -45,11 +45,11 @@ class CommandFolder(Callback):
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         """Notes a run's folder."""
-        COMMAND.append((_expanded(config, "hydra.run.dir"), None))
+        COMMAND.append((Path(config.hydra.run.dir).absolute(), None))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Notes a sweep's folder, and which runs failed there before."""
-        folder = _expanded(config, "hydra.sweep.dir")
+        folder = Path(config.hydra.sweep.dir).absolute()
         COMMAND.append((folder, _failures(folder)))
 
 
@@ -96,7 +96,7 @@ def _main(hydra_config: DictConfig) -> float:
     try:
         (path / FAILURE).unlink(missing_ok=True)  # a run that failed is tried again
         asked = invocation(about, path)
-        check_groups(asked.overrides)
+        check_scale(asked.overrides)
         check_chosen(hydra_config, about)
         with signals:  # already now: amid imports is no place to stop
             from proposer_rl.cli.config import read_config  # only now: it takes seconds
@@ -149,17 +149,6 @@ def _show_settings(words: Sequence[str], read: Namespace) -> None:
     part: Any = OmegaConf.select(config, read.package or "")
     text = OmegaConf.to_yaml(part, resolve=read.resolve) if OmegaConf.is_config(part) else part
     print(str(text).rstrip())
-
-
-def _expanded(config: DictConfig, key: str) -> Path:
-    """Returns a folder of Hydra's configuration; ``~`` becomes the home folder there, too."""
-    given = str(OmegaConf.select(config, key))
-    path = Path(given).expanduser()
-    if given.startswith("~"):
-        with read_write(config.hydra), open_dict(config.hydra):
-            OmegaConf.update(config, key, str(path))
-            config.hydra.overrides.hydra.append(quoted(key, str(path)))  # for a sweep's jobs
-    return path.absolute()
 
 
 def _failures(folder: Path) -> dict[Path, int]:
