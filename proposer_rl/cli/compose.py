@@ -1,4 +1,4 @@
-"""A run in a process that is not Hydra's: what ``prl.train`` calls."""
+"""Composes and carries out a run for ``prl.train``, without Hydra's command line."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from proposer_rl.runs.process import StopSignals
 def compose_and_run(
     words: Sequence[str], settings: Sequence[Mapping[str, Any]], folder: Path | None
 ) -> Path:
-    """Trains as ``bin/train`` with these settings does; threads may call it side by side.
+    """Trains as ``bin/train`` does with the same settings; several threads may call it at once.
 
     Args:
-        words: names of files, as on the command line.
-        settings: by top-level key, merged into what the files have; later ones win.
-        folder: the run's; None for a new one below ``outputs/``.
+        words: overrides of Hydra's that choose files.
+        settings: by top-level key, merged into those of the files; of two the later one counts.
+        folder: of the run; None for a new one below ``outputs/``.
 
     Returns:
         The run's folder, absolute.
@@ -49,7 +49,7 @@ def compose_and_run(
 
 
 def _new_folder(config: RunConfig) -> Path:
-    """Makes a folder for a run that was given none."""
+    """Creates a folder for a run."""
     parent = Path("outputs") / config.method
     first = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_seed_{config.seed}"
     for name in chain([first], (f"{first}_{number}" for number in count(2))):

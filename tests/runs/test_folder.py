@@ -70,8 +70,8 @@ def test_float64_of_numpy_is_a_float(folder: RunFolder) -> None:
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ({"update": 2}, "a row has update; its columns are update, loss"),
-        ({"update": 2, "loss": 0.1, "more": 1}, "a row has update, loss, more; its columns are"),
+        ({"update": 2}, "a row has update; the columns are update, loss"),
+        ({"update": 2, "loss": 0.1, "more": 1}, "a row has update, loss, more; the columns are"),
     ],
 )
 def test_refuses_a_row_and_leaves_the_table(
