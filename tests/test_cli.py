@@ -267,14 +267,6 @@ def test_a_disk_that_takes_no_more_is_named_with_its_folder(
     assert line == f"error: cannot use {Path(place).absolute()}: File too large"
 
 
-def test_a_damaged_summary_is_written_again(run: Path, train) -> None:
-    whole = json.loads((run / "summary.json").read_text())
-    (run / "summary.json").write_text("{")
-    assert train(*COMMAND) == 0
-    again = json.loads((run / "summary.json").read_text())
-    assert {**again, "seconds": 0, "final": 0} == {**whole, "seconds": 0, "final": 0}
-
-
 def test_a_run_goes_on_in_the_precision_that_it_began_with(
     run: Path, train, capsys, monkeypatch
 ) -> None:

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 import json
 import pickle
-import resource
 import shutil
 import sys
 import warnings
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import hypothesis
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hypothesis import HealthCheck, given
-from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from proposer_rl.cli.build import Made, build, parts
@@ -30,15 +25,12 @@ from proposer_rl.cli.errors import (
     UNFORESEEN,
     ConfigError,
     exit_code,
-    lacks_memory,
     one_line,
 )
 from proposer_rl.cli.groups import arranged
 from proposer_rl.cli.run import check_same_run
 from proposer_rl.extras import install_command
-from proposer_rl.learning import DivergedError
-from proposer_rl.recipes import CONFIG_FOLDER, available
-from proposer_rl.runs.checkpoint import load_latest
+from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.process import Interrupted, StopSignals
 from tests.same_run import assert_same_run
@@ -370,98 +362,6 @@ def test_what_may_differ_in_a_resumed_run(finished: Path, train) -> None:
     assert train("+method=target", *few, "hydra.run.dir=run", *free) == 0
     assert train("+method=target", *few, "hydra.run.dir=whole") == 0
     assert_same_run(Path("whole"), folder)
-
-
-# Nonsense, and what may well be valid.
-WILD = st.one_of(
-    st.integers(-2, 9),
-    st.integers(),
-    st.floats(),
-    st.sampled_from([0.5, 1e-3, 10**30, True, False, None, "", "x", "id", "auto", "cpu"]),
-    st.lists(st.one_of(st.integers(-1, 5), st.floats(0, 1), st.just("id")), max_size=3),
-    st.dictionaries(st.sampled_from(["a", "height", "_target_"]), st.integers(), max_size=2),
-)
-
-
-def like(value: Any) -> st.SearchStrategy[Any]:
-    """Values of the same kind as one that is valid."""
-    if isinstance(value, bool):
-        return st.booleans()
-    if isinstance(value, int):
-        return st.integers(0, 9)
-    if isinstance(value, float):
-        return st.floats(0, 1)
-    if isinstance(value, list) and value:
-        return st.lists(like(value[0]), max_size=3)
-    words = ["id", "ood", "mix", "uniform", "path_first", "sample", "mode", "joint", "rollout"]
-    return st.sampled_from([*words, "best", "random", "bf16", "mixture", "all", None])
-
-
-def keys_of(values: Any, place: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
-    if not isinstance(values, dict):
-        return [place]
-    inner = [found for key, value in values.items() for found in keys_of(value, (*place, key))]
-    return [*([place] if place else []), *inner]
-
-
-def smoke(method: str) -> dict[str, Any]:
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
-        config = compose("train", [f"method={method}", "scale=smoke", "compute.progress=false"])
-    return OmegaConf.to_container(config, resolve=True)
-
-
-@pytest.fixture
-def little_memory() -> Iterator[None]:
-    """What asks for many GiB is told so, where the system would end the process; on Linux."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    if (taken := Path("/proc/self/statm")).exists():
-        now = int(taken.read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (now + 4 * 2**30, hard))
-    yield
-    resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
-@pytest.mark.usefixtures("little_memory")
-@hypothesis.settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_whatever_the_values_a_run_starts_or_is_refused_in_one_line(
-    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    values = smoke(data.draw(st.sampled_from(available("method"))))
-    for _ in range(data.draw(st.integers(1, 3))):
-        *folder, key = data.draw(st.sampled_from(keys_of(values)))
-        holder = values
-        for part in folder:
-            holder = holder[part]
-        plain = not isinstance(holder[key], dict) and data.draw(st.integers(0, 3))
-        holder[key] = data.draw(like(holder[key]) if plain else WILD)
-    folder = RunFolder(tmp_path_factory.mktemp("run"))
-    if isinstance(values["compute"], dict):
-        values["compute"]["threads"] = None  # of this very process
-    try:
-        config = read_config(OmegaConf.create(values))
-        made = parts(config, StopSignals())
-        check_same_run(folder, config)
-        build(config, made, folder, signals=At.once()).run()
-    except Interrupted:
-        hypothesis.event("a run starts")
-        assert load_latest(folder.path / "checkpoints") is not None
-    except DivergedError:
-        hypothesis.event("a run diverges")
-        assert load_latest(folder.path / "checkpoints") is None
-    except Exception as error:
-        if exit_code(error) == UNFORESEEN:
-            raise
-        if lacks_memory(error):  # perhaps only when it measured
-            hypothesis.event("does not fit in memory")
-            return
-        hypothesis.event("refused")
-        assert not isinstance(error, OSError), repr(error)
-        assert str(error).strip()
-        assert list(folder.path.iterdir()) == []
-    else:
-        raise AssertionError("the signal was not heeded")
 
 
 @pytest.mark.parametrize(

@@ -84,18 +84,6 @@ def test_seeds_side_by_side_give_what_they_give_alone(train) -> None:
     assert summary["solver_parameters"] == alone["solver_parameters"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["+method=target", "seeds=[1,1]"], "seeds=[1, 1]: must be distinct"),
-        (["+method=target", "seeds=[]"], "seeds=[]: list should have at least 1 item"),
-    ],
-)
-def test_wrong_seeds_get_one_line(arguments, message: str, train, capsys) -> None:
-    assert train(*arguments, *FEW) == 2
-    assert message in capsys.readouterr().err
-
-
 def states(folder: Path) -> dict[str, float]:
     """When the summary of each run was written."""
     return {path.parent.name: path.stat().st_mtime_ns for path in folder.glob("*/summary.json")}

@@ -91,7 +91,7 @@ class Interrupted(Exception):
         saved = f"stopped by {signal.Signals(self.signum).name}; all is saved"
         if self.folder is None:
             return saved
-        return f"{saved}. To resume, make the same call with folder={str(self.folder)!r}"
+        return f"{saved}. To resume, call again with folder={str(self.folder)!r}"
 
     @property
     def exit_code(self) -> int:
