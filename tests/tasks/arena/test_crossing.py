@@ -8,7 +8,6 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
 from proposer_rl.tasks.arena.crossing import CrossingEnv
