@@ -1,4 +1,4 @@
-"""From folders of runs to a folder with the evidence: page, figures, tables."""
+"""Writes a report on runs: a page, figures and tables."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
 # These are no charts, so that the page has them as pictures.
 STILL = {figures.side_by_side, figures.recorded_by_curricula}
 
-# What is to be said of means over the worst share of the levels, by whether they are exact.
+# A caveat on means over the worst share of the levels, by whether measurements are exact.
 SELECTION = {
-    True: "The measurements are exact, so that no second evaluation is needed: to sort the levels "
-    "by what is averaged selects no luck.",
-    False: "The measurements are sampled, and the levels are sorted by what is averaged: selection "
-    "bias makes the means too low, the more the smaller the share.",
+    True: "Measurements are exact, so sorting the levels by them adds no bias, and no second "
+    "evaluation is needed.",
+    False: "Measurements are sampled and the levels are sorted by them, so selection bias makes "
+    "these means too low, the more the smaller the share.",
     None: "The runs do not say whether their measurements are exact. If they are sampled, "
-    "selection bias makes the means too low, the more the smaller the share.",
+    "selection bias makes these means too low, the more the smaller the share.",
 }
 
 

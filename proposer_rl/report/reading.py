@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from proposer_rl.report.runs import COST, LARGEST_FILE, NAMES, STUDY, Run
+from proposer_rl.report.runs import COST, NAMES, STUDY, Run
 from proposer_rl.runs.folder import FAILURE, is_rate, read_csv, read_jsonl
 from proposer_rl.runs.records import (
     LARGEST,
@@ -94,10 +94,7 @@ def read_run(folder: Path) -> list[Run]:
 
 
 def _read_folder(folder: Path) -> list[Run]:
-    pictures = folder / "curriculum.jsonl"
-    # Of many seeds and evaluations they are too many; all else of the run can be shown.
-    large = pictures.is_file() and pictures.stat().st_size > LARGEST_FILE
-    recorded = [] if large else _optional(pictures, read_jsonl)
+    recorded = _optional(folder / "curriculum.jsonl", read_jsonl)
     return _runs(
         folder,
         _read_json(folder / "config.json"),

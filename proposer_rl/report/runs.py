@@ -1,10 +1,9 @@
-"""A run as a report sees it, one seed of a folder, and runs as a few tidy tables.
+"""A run as a report sees it, which is one seed of a folder; and the tidy tables of runs.
 
-The tables are of a report, and of a study, which is read as runs are. A study's folder has
-``runs.csv.xz``, a row for each run with its settings and facts as JSON, and the tables ``metrics``,
-``training``, ``cycles`` and ``levels``, each a row for what a run recorded at one moment, of one
-cycle or of one level. Cells of ``cycles`` are JSON, so that lists stay lists. Every number is
-written so that it reads back bit for bit.
+Reports and studies have the same tables. The folder of a study has ``runs.csv.xz``, with a row for
+each run whose settings and facts are JSON, and the tables ``metrics``, ``training``, ``cycles`` and
+``levels`` with a row for each evaluation, cycle or level. Cells of ``cycles`` are JSON, so that
+lists stay lists. Every number is written so that it reads back bit for bit.
 """
 
 from __future__ import annotations
@@ -38,7 +37,6 @@ OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_n
 _STUDENT = re.compile(r"lifetime_(\d{1,9})")
 STUDY = "runs.csv.xz"  # what makes a folder a study's
 NAMES = ("metrics", "training", "cycles", "levels")
-LARGEST_FILE = 64 * 2**20  # bytes of pictures that are read
 
 
 @dataclass(frozen=True)
