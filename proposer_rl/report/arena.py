@@ -26,7 +26,7 @@ COLUMNS = 4  # of the figure
 
 @dataclass(frozen=True)
 class Arena:
-    """Tasks that have all baselines, and the methods on them.
+    """The tasks that have all baselines, and the methods on them.
 
     Attributes:
         tasks: by their names, in the order of these.
@@ -56,7 +56,7 @@ class Arena:
 
     @cached_property
     def better(self) -> dict[str, str]:
-        """The baseline of the highest mean on every task."""
+        """The baseline with the highest mean on each task."""
         return {
             task: max(self.baselines, key=lambda label: _mean(study, label))
             for task, study in self.tasks.items()
@@ -82,7 +82,7 @@ class Arena:
 
     @cached_property
     def leads(self) -> dict[str, tuple[Estimate, float]]:
-        """The first method's lead over each other one in the mean, with Holm's p-value."""
+        """The first method's mean lead over each other one, with its corrected p-value."""
         first, *others = self.found
         means = [statistics.mean_of_estimates(self._common(first, other)) for other in others]
         corrected = statistics.holm([mean.p for mean in means])
@@ -94,7 +94,7 @@ class Arena:
 
     @cached_property
     def rows(self) -> list[Row]:
-        """Every method beside the first baseline, in the mean over tasks; the best first.
+        """Every method against the first baseline in the mean over tasks, the best first.
 
         Methods that lack a task come after those that have all.
         """
@@ -146,7 +146,7 @@ class Arena:
 
 
 def arena(studies: Sequence[Study], baselines: Sequence[str] = ()) -> Arena | None:
-    """Returns the tasks that have all baselines and measure a rate; None for fewer than two.
+    """Returns the tasks that have all baselines and measure a rate; None if fewer than two do.
 
     Args:
         studies: each a task.
@@ -166,7 +166,7 @@ def arena(studies: Sequence[Study], baselines: Sequence[str] = ()) -> Arena | No
 
 
 def summary(arena: Arena) -> Table:
-    """Returns a row for each method: worst case over tasks, mean, and the first method's lead."""
+    """Returns a table of each method's worst case and mean over tasks, and the first one's lead."""
     first, *_ = arena.found
     rows: list[dict[str, Cell]] = []
     every = len(arena.tasks)
@@ -212,7 +212,7 @@ def about_rows(arena: Arena) -> str:
 
 
 def task_table(arena: Arena) -> Table:
-    """Returns a row for each method and task: its differences to the baselines."""
+    """Returns a table of the differences to the baselines by method and task."""
     rows: list[dict[str, Cell]] = []
     for label, found in arena.found.items():
         for task, to_better in found.items():
@@ -255,7 +255,7 @@ def answer(arena: Arena) -> list[str]:
 
 
 def differences(arena: Arena) -> Drawing:
-    """Returns a figure of each method's difference to the better baseline on every task."""
+    """Draws each method's difference to the better baseline on every task."""
     count = len(arena.found)
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
@@ -309,7 +309,7 @@ def _worst(found: Mapping[str, Estimate]) -> Estimate:
 
 
 def _names(studies: Sequence[Study]) -> list[str]:
-    """Returns unique names of tasks: as on the command lines, or else the studies' titles."""
+    """Returns unique names of tasks, from the command lines or else the studies' titles."""
     names, seen = [], Counter[str]()
     for study in studies:
         words = study.example.facts.get("overrides") or []

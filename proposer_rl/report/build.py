@@ -56,7 +56,7 @@ def read_checked(
     baselines: Sequence[str],
     compare: Sequence[str] = (),
 ) -> tuple[list[Study], list[str]]:
-    """Returns the studies of the runs in some folders and notes; see :func:`write_report`."""
+    """Reads runs into studies, with notes on what was left out, and checks what was asked for."""
     first, found = next(iter(baselines), None), find_runs(folders)
     studies, notes = read_studies(found, threshold, first, compare)
     every = dict.fromkeys(path for folder in folders for path in begun(folder))
@@ -146,12 +146,12 @@ def write_report(
 
 
 def check_output(output: Path, *signs: str) -> None:
-    """Refuses an output folder that holds files which no report has written."""
+    """Refuses an output folder that has files in it but none of a former output."""
     occupied = output.exists() and any(output.iterdir())
     if occupied and not any((output / sign).is_file() for sign in signs):
         raise OutputError(
-            f"{output}: has files in it but no {' or '.join(signs)}; give a new folder or one that "
-            "was written before"
+            f"{output}: is not empty, and has no {' or '.join(signs)}; use a new directory, or one "
+            "that this command has written"
         )
 
 

@@ -78,7 +78,7 @@ def comparison_table(study: Study) -> Table:
 
 
 class Row(NamedTuple):
-    """A method beside the baseline, as the first table of a report shows it.
+    """A method against the baseline, as in the first table of a report.
 
     Attributes:
         label: of the method.
@@ -109,12 +109,12 @@ class Row(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """The row in words."""
+        """The row as a sentence."""
         return f"{self.says}, {self.verdict}." if self.asked else f"{self.says}."
 
 
 def first_rows(study: Study) -> list[Row]:
-    """Returns all methods beside the baseline, the highest mean over seeds first."""
+    """Returns all methods against the baseline, the highest mean over seeds first."""
     outcome, baseline = primary(study), study.baseline
     every = against_baseline(replace(study, planned=(), chosen=baseline.label))
     found = every | against_baseline(study)
@@ -139,7 +139,7 @@ def first_rows(study: Study) -> list[Row]:
 
 
 def factors(group: Group, baseline: Group) -> tuple[float, float]:
-    """Returns how many times the frames and the seconds of the baseline a method took."""
+    """Returns a method's frames and seconds as multiples of the baseline's."""
     found = []
     for spent in (lambda run: run.total_frames[-1], lambda run: run.own_seconds[-1]):
         own, other = (np.mean([*map(spent, each.runs)]) for each in (group, baseline))
@@ -153,7 +153,7 @@ def signed(difference: Interval) -> str:
 
 
 def cost(frames: float, seconds: float) -> str:
-    """Returns in words what a method costs beside the baseline."""
+    """Returns a method's cost in words, as multiples of the baseline's."""
     return f"{times(frames)}× the frames and {times(seconds)}× the seconds"
 
 
@@ -324,7 +324,7 @@ def answer(study: Study) -> list[str]:
 
 
 def meaning(group: Group, meanings: Meanings) -> str:
-    """Returns what a method does, in a line: as its runs recorded it, or else as given."""
+    """Describes a method in a line, as its runs recorded it or else as given."""
     run = group.runs[0]
     about = run.facts.get("about", {})
     said = [

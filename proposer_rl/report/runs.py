@@ -90,7 +90,7 @@ class Run:
 
     @property
     def headline(self) -> str:
-        """The measurement that runs are summed up by."""
+        """The measurement by which runs are compared."""
         return str(self.config["schedule"]["headline"])
 
     @property
@@ -113,7 +113,7 @@ class Run:
 
     @property
     def planned(self) -> int | None:
-        """Updates that the run shall have; None where the folder does not say."""
+        """The planned number of updates; None where the folder does not say."""
         value: int | None = self.facts.get("planned_updates", self.facts.get("updates"))
         return value
 
@@ -124,12 +124,12 @@ class Run:
 
     @cached_property
     def total_frames(self) -> Column:
-        """Environment frames at each evaluation, those that the curriculum spent included."""
+        """Environment frames at each evaluation, including those of the curriculum."""
         return self.columns["frames"] + self.columns["curriculum_frames"]
 
     @cached_property
     def own_seconds(self) -> Column:
-        """Wall seconds at each evaluation: an even share where seeds were trained together."""
+        """Wall seconds at each evaluation; an even share where seeds were trained together."""
         return self.columns["seconds"] / self.shared_by
 
     def last(self, name: str) -> float:
@@ -200,7 +200,7 @@ class Run:
 
     @property
     def whose_cycles(self) -> tuple[Path, Any]:
-        """What tells its cycles from another run's: its folder and, where they have one, a seed."""
+        """A key of its cycles: its folder and, where they have one, their seed."""
         return self.folder, self.cycles[0].get("seed") if self.cycles else None
 
     def shares(self, cycle: Record) -> Column | None:
@@ -221,7 +221,7 @@ def share_map(shares: Column) -> Column:
 
 
 def tables(runs: Iterable[tuple[str, Run]], key: str = "run") -> dict[str, pd.DataFrame]:
-    """Returns what runs recorded as tables, a row for each moment, cycle or level.
+    """Returns the records of runs as tables, with a row for each evaluation, cycle or level.
 
     Args:
         runs: each with the name that its rows carry.

@@ -41,7 +41,7 @@ class Interval(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """A mean, or a difference of means, that Student's distribution holds for.
+    """A mean, or a difference of means, with its error by Student's distribution.
 
     Attributes:
         value: the estimate.
@@ -96,7 +96,7 @@ def difference_of(one: Values, other: Values, paired: bool = False) -> Estimate:
 
 
 def mean_of_estimates(found: Sequence[Estimate]) -> Estimate:
-    """Returns the mean of independent estimates, which count alike.
+    """Returns the unweighted mean of independent estimates.
 
     Its error is NaN where one of theirs is not known, or none has any.
     """

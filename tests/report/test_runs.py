@@ -108,7 +108,7 @@ def replaced(old: str, new: str):
         ("metrics.csv", replaced("0.5", "1e300"), "id_success is not always a number"),
         ("metrics.csv", replaced("id_success", "x"), "id_success is not always a number"),
         ("metrics.csv", replaced("0.5", "half"), "metrics.csv, line 3: could not convert string"),
-        ("metrics.csv", lambda text: text + text.splitlines()[1] + "\n", "do not grow"),
+        ("metrics.csv", lambda text: text + text.splitlines()[1] + "\n", "must increase"),
         ("curriculum.jsonl", replaced('"seed": 0', '"seed": "0"'), "0.seed: Input should be a"),
         ("cycles.jsonl", replaced('"cycle": 0', '"levels": ["x"]'), "cycles.jsonl: levels: Input"),
     ],
