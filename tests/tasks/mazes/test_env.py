@@ -113,17 +113,6 @@ def test_unfinished_episodes_end_on_the_levels_they_began_on() -> None:
     assert env.levels.to_text() == ["G.S", ".GS"]
 
 
-@pytest.mark.parametrize(
-    "levels",
-    [random_levels(2, 4, 4, 0.2, 0), random_levels(3, 4, 5, 0.2, 0)],
-    ids=["batch", "grid"],
-)
-def test_levels_of_another_shape_are_refused(levels: Level) -> None:
-    env = MazeEnv(random_levels(3, 4, 4, 0.2, 0))
-    with pytest.raises(RuntimeError):  # torch's own
-        env.set_levels(levels)
-
-
 def test_what_is_stepped_decides_where_the_agent_is() -> None:
     """A step is a function of the tensordict, so any state can be returned to."""
     env = MazeEnv(ROOM)
