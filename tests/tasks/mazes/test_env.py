@@ -54,14 +54,6 @@ def test_agent_is_observed_on_demand_only() -> None:
     assert shown["planes"][3].nonzero().tolist() == [[0, 1]]
 
 
-def test_goal_at_the_step_limit_terminates_and_does_not_truncate() -> None:
-    env = MazeEnv(ROOM, max_steps=3)
-    state = env.reset()
-    for action in (DOWN, RIGHT, RIGHT):
-        state = step(env, state, action)
-    assert state["terminated"] and state["done"] and not state["truncated"]
-
-
 @settings(max_examples=40)
 @given(
     size=st.tuples(st.integers(1, 5), st.integers(2, 5)),

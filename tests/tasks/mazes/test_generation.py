@@ -294,17 +294,6 @@ def test_one_generator_for_each_index_draws_as_each_alone(mechanism: str, copies
 SPACE = SpecificationSpace([0.0, 0.25, 0.5], [2, 5], height=6, width=6)
 
 
-@pytest.mark.parametrize("shape", [(), (4,), (2, 3), 5])
-@pytest.mark.parametrize("mechanism", ["uniform", "path_first"])
-def test_distribution_gives_its_specification(shape: tuple[int, ...] | int, mechanism: str) -> None:
-    distribution = LevelDistribution([(0.3, 6)], mechanism, height=5, width=8)
-    levels = distribution.sample(shape, seeded())
-    assert levels.batch_size == torch.zeros(shape).shape
-    assert (levels.walls.sum((-1, -2)) == 12).all()
-    assert (shortest_path_length(levels) == 6).all()
-    assert (levels == distribution.sample(shape, seeded())).all()
-
-
 def test_numbers_run_through_lengths_first() -> None:
     assert SPACE.size == 6
     assert SPACE.axes == {"obstacle fraction": (0.0, 0.25, 0.5), "path length": (2, 5)}

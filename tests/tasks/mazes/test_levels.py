@@ -59,11 +59,6 @@ def test_planes_show_obstacles_start_and_goal() -> None:
         )
 
 
-def test_valid_levels_pass() -> None:
-    validate_levels(random_levels(5, 3, 3, 0.5, 0))
-    validate_levels(Level.from_text(DRAWING))
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -115,8 +110,3 @@ def test_any_batch_shape(shape: tuple[int, ...]) -> None:
     lengths = shortest_path_length(batch)
     assert (lengths.shape, lengths.dtype) == (shape, torch.int64)
     assert lengths.flatten().tolist() == [path_length(level) for level in levels[:count]]
-
-
-def test_longest_path_of_a_snake() -> None:
-    level = Level.from_text("S....\n####.\n.....\n.####\n....G")
-    assert shortest_path_length(level).item() == 16
