@@ -249,8 +249,8 @@ class GymnasiumTask(Task):
         """
         if self._unpaid():
             raise ValueError(
-                "transforms: these are not applied to observations of a plain environment; put "
-                "run.solver().actor() into a TransformedEnv with them"
+                "transforms: a plain environment does not apply these; use run.solver().actor() "
+                "in a TransformedEnv with them"
             )
         env = LevelPlayer(self._make, self._parameters, self._first)
         env.close()

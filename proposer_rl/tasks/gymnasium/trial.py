@@ -52,7 +52,7 @@ def check_environment(
     player = LevelPlayer(make, parameters, target, success)
     limit = min((one._max_episode_steps for one in time_limits(player)), default=None)
     if limit is None:
-        raise ValueError("max_steps: missing: the environment has no time limit of its own")
+        raise ValueError("max_steps: missing, and the environment has no time limit of its own")
     _check_episode(player, success, limit)
     for name, part in bins.items():
         each = isinstance(part, Labelled) or parameters[name].to is not None
