@@ -94,17 +94,6 @@ def test_shares_are_a_distribution_that_follows_the_scores(
         torch.testing.assert_close(score_weights(score[order], full, rule), weight[order])
 
 
-@pytest.mark.parametrize("kind", ["rank", "proportional", "softmax"])
-def test_temperature_goes_from_the_best_alone_to_all_alike(kind: Any) -> None:
-    positive, five = SCORE + 0.3, torch.full((5,), 0.2, dtype=torch.float64)
-    hot = score_weights(positive, FULL, ReplayRule(prioritization=kind, temperature=1e6))
-    torch.testing.assert_close(hot, five, atol=1e-5, rtol=0)
-    cold = score_weights(positive, FULL, ReplayRule(prioritization=kind, temperature=1e-2))
-    assert cold[0] > 1 - 1e-9
-    same = score_weights(torch.zeros(5), FULL, ReplayRule(prioritization=kind))
-    torch.testing.assert_close(same, five)
-
-
 def levels(*numbers: int) -> TensorDict:
     """Levels [n] that are equal where their numbers are."""
     count = len(numbers)
