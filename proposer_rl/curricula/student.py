@@ -278,7 +278,7 @@ def values(steps: TensorDictBase) -> Tensor:
     """
     if VALUE not in steps.keys():
         raise ArgumentError(
-            f"rollout: lacks {VALUE} at each step and in next, which this curriculum needs; let a "
+            f"rollout: has no {VALUE} at each step and in next, which this curriculum needs; let a "
             "critic write it first, as GAE does, or use a score that needs no critic"
         )
     value: Tensor = steps[VALUE]
