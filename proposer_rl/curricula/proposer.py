@@ -181,7 +181,7 @@ class ProposerTrainer:
         rewards = rollout["next", "reward"].sum((-2, -1))  # [K]
         replicas = len(rewards)
         student.spend(
-            frames=replicas * env.frames_per_update * env.meta_episode_length,
+            frames=replicas * env.batch_of_levels * env.solvers.horizon * env.meta_episode_length,
             # Every replica after each of its actions, and once at the start.
             evaluations=replicas * (env.steps + 1) * env.view.validation_levels,
         )

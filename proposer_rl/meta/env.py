@@ -206,11 +206,6 @@ class SolverTrainingEnv(EnvBase):
         """The number P of levels in an update."""
         return int(self.solvers.env.batch_size[1:].numel())
 
-    @property
-    def frames_per_update(self) -> int:
-        """The number of environment steps in one Solver's update."""
-        return self.batch_of_levels * self.solvers.horizon
-
     def fork(self, solver: TensorDictBase, streams: Streams) -> None:
         """Starts the next episodes from one Solver, with new validation and probe levels.
 

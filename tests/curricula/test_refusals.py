@@ -49,7 +49,6 @@ REFUSED: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (rows, {"row": "level"}, "row=level: unknown; there are: obstacle fraction, path length"),
     (c.RowsCurriculum, {"space": ONE_ROW}, "row=row: has a single row; give the axis bins"),
     (replay, {"train_on_new": True, "synchronous": True}, "train_on_new=true, synchronous=true: "),
-    (replay, {"co_learnability": 1.0, "renew": True}, r"co_learnability=1\.0, renew=true: "),
     (no_edits, {"edits": 1}, "edits=1: the task must define edit"),
     (replay, {"new_levels": {"walls": [1]}}, r"new_levels.walls=\[1.0\]: must be among"),
     (replay, {"new_levels": {"path length": []}}, r"new_levels.path length=\[\]: "),
