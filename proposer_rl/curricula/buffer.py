@@ -158,10 +158,7 @@ def replay_weights(score: Tensor, age: Tensor, filled: Tensor, rule: ReplayRule)
 
 
 def draw_slots(
-    buffer: TensorDictBase,
-    count: int,
-    rule: ReplayRule,
-    generator: torch.Generator,
+    buffer: TensorDictBase, count: int, rule: ReplayRule, generator: torch.Generator
 ) -> Tensor:
     """Draws levels one after another; each draw advances the clock and resets the age of its level.
 

@@ -173,12 +173,7 @@ class AdaptiveDifficulty(ItemCurriculum):
 
     @checked
     def __init__(
-        self,
-        space: Space,
-        *,
-        step: Positive = 0.5,
-        sensitivity: Positive = 2.0,
-        aim: Share = 0.5,
+        self, space: Space, *, step: Positive = 0.5, sensitivity: Positive = 2.0, aim: Share = 0.5
     ) -> None:
         super().__init__(space)
         rates: Tensor | None = getattr(space, "pass_rates", None)

@@ -44,10 +44,7 @@ class RunTables:
                 self._folder.append("levels.jsonl", row)
 
     def add_training(
-        self,
-        updates: int,
-        played: Sequence[tuple[Levels, TensorDictBase]],
-        metrics: TensorDictBase,
+        self, updates: int, played: Sequence[tuple[Levels, TensorDictBase]], metrics: TensorDictBase
     ) -> None:
         """Writes each Solver's metrics of an update, and a sample of its levels.
 

@@ -75,10 +75,7 @@ class ReplicasInWorkers(Replicas):
     """
 
     def __init__(
-        self,
-        proposer: PPO,
-        make_env: Callable[..., SolverTrainingEnv],
-        settings: WorkerSettings,
+        self, proposer: PPO, make_env: Callable[..., SolverTrainingEnv], settings: WorkerSettings
     ) -> None:
         super().__init__(proposer)
         self._make_env = make_env

@@ -14,11 +14,7 @@ from torch import Tensor, nn
 
 from proposer_rl import curricula as c
 from proposer_rl import methods, models
-from proposer_rl.curricula import (
-    Curriculum,
-    Filtered,
-    FirstOrderProposer,
-)
+from proposer_rl.curricula import Curriculum, Filtered, FirstOrderProposer
 from proposer_rl.learning import PPO, DivergedError, PPOSettings, SolverSettings
 from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components

@@ -14,10 +14,7 @@ from scipy.stats import kstest, truncnorm
 import proposer_rl as prl
 from proposer_rl.curricula import SelfPacedCurriculum
 from proposer_rl.curricula import self_paced as spdl
-from proposer_rl.curricula.optimal_transport import (
-    TransportCurriculum,
-    step_towards,
-)
+from proposer_rl.curricula.optimal_transport import TransportCurriculum, step_towards
 from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components, build
 from proposer_rl.tasks.mazes import SpecificationSpace
