@@ -53,18 +53,12 @@ class ProposerCurriculum(LearnedCurriculum):
         own_action: Literal["sample", "mode"],
         trainer: ProposerTrainer | None = None,
     ) -> None:
-        self.agent = agent
-        self.view = view
-        self.actions = actions
-        self.meta_episode_length = meta_episode_length
-        self.action_repeat = action_repeat
+        self.agent, self.view, self.actions, self.trainer = agent, view, actions, trainer
+        self.meta_episode_length, self.action_repeat = meta_episode_length, action_repeat
         self.own_action = own_action
-        self.trainer = trainer
-        # The first two to see the student, a snapshot to make replicas of it.
-        self.needs = ("performance", "probe")
         self.trains_replicas = trainer is not None
-        if self.trains_replicas:
-            self.needs += ("snapshot",)
+        # The first two to see the student, a snapshot to make replicas of it.
+        self.needs = ("performance", "probe", *["snapshot"] * self.trains_replicas)
         self._proposed = 0  # batches of this cycle
         self._action: Tensor | None = None
 
@@ -154,8 +148,7 @@ class ProposerTrainer:
                 f"the Proposer's horizon {learner.settings.horizon} must be the "
                 f"meta-environment's number of steps, {env.steps}"
             )
-        self.learner = learner
-        self.env = env
+        self.learner, self.env = learner, env
         self.replicas = replicas or Replicas(learner)
 
     def curriculum(self, own_action: Literal["sample", "mode"]) -> ProposerCurriculum:

@@ -71,22 +71,17 @@ class Experiment:
         status: Status | None = None,
     ) -> None:
         check_headline(task, schedule)
-        self.task = task
-        self.learner = learner
+        self.task, self.learner = task, learner
         self.sides = SideBySide(task, learner, curricula)
         self._continued: ContinuedLevels | None = None
         if learner.settings.continue_episodes:
             like = next(iter(task.evaluated_on.values()))[0]
             self._continued = ContinuedLevels(curricula, self.sides.students, learner, like)
-        self.schedule = schedule
-        self.seeds = list(seeds)
-        self.folder = folder
-        self.updates = 0
-        self.cycles = 0
+        self.schedule, self.seeds, self.folder = schedule, list(seeds), folder
+        self.updates, self.cycles = 0, 0
         self._tables = RunTables(task, self.seeds, folder, log)
         self._progress = progress
-        self._signals = signals or StopSignals()
-        self._status = status or Status()
+        self._signals, self._status = signals or StopSignals(), status or Status()
         self._headline: list[float] = []
         self._checkpoints = 0
         self._seconds_before = 0.0
@@ -166,24 +161,15 @@ class Experiment:
         """Computes sample efficiency and cost so far from the metrics in the folder."""
         rows = read_csv(self.folder.path / "metrics.csv")
         headline, threshold = self.schedule.headline, self.schedule.threshold
-        reached = {
-            seed: next(
-                (
-                    int(row["updates"])
-                    for row in rows
-                    if row["seed"] == seed and row[headline] >= threshold - SLACK
-                ),
-                None,
-            )
-            for seed in self.seeds
-        }
+        met = [row for row in rows if row[headline] >= threshold - SLACK]
+        reached = [[int(row["updates"]) for row in met if row["seed"] == s] for s in self.seeds]
         return {
             "updates": self.updates,
             **{name: max(own[name] for own in self.costs) for name in self.costs[0]},
             "headline": headline,
             "threshold": threshold,
             # null: censored, the threshold was not reached within ``updates``
-            "updates_to_threshold": [reached[seed] for seed in self.seeds],
+            "updates_to_threshold": [next(iter(updates), None) for updates in reached],
             "final": [row for row in rows if row["updates"] == self.updates],
         }
 
@@ -273,12 +259,8 @@ class Experiment:
 
     def _save(self, state: State) -> None:
         self._checkpoints += 1
-        save_checkpoint(
-            self.folder.path / "checkpoints",
-            self._checkpoints,
-            state,
-            self.schedule.keep_checkpoints,
-        )
+        folder, keep = self.folder.path / "checkpoints", self.schedule.keep_checkpoints
+        save_checkpoint(folder, self._checkpoints, state, keep)
         self._saved = time.monotonic()
 
     def _state(self) -> State:

@@ -79,8 +79,7 @@ class SolverView:
 
     def __init__(self, task: Task, *, validation_levels: int, probe_levels: int) -> None:
         self.task = task
-        self.validation_levels = validation_levels
-        self.probe_levels = probe_levels
+        self.validation_levels, self.probe_levels = validation_levels, probe_levels
         self.draw_levels(Streams(0))
 
     def draw_levels(self, streams: Streams) -> None:
@@ -186,13 +185,9 @@ class SolverTrainingEnv(EnvBase):
         assert solvers.copies is not None  # a population
         self._replicas = range(first_replica, first_replica + solvers.copies)
         super().__init__(device=solvers.env.device, batch_size=[len(self._replicas)])
-        self.solvers = solvers
-        self.view = view
-        self.actions = actions
-        self.meta_episode_length = meta_episode_length
-        self.action_repeat = action_repeat
-        self._reward = reward
-        self.on_update = on_update or (lambda done: None)
+        self.solvers, self.view, self.actions = solvers, view, actions
+        self.meta_episode_length, self.action_repeat = meta_episode_length, action_repeat
+        self._reward, self.on_update = reward, on_update or (lambda done: None)
         self.fork(solvers.snapshot()[0], Streams(0))
         self._make_specs()
 

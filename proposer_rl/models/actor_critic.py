@@ -58,10 +58,8 @@ class ActorCritic(TensorDictModuleBase):
         memory: Mapping[str, int] | None = None,
     ) -> None:
         super().__init__()
-        self.head = head
-        self.encoder = encoder
-        self.distribution_class = distribution_class
-        self.copies = copies
+        self.head, self.encoder = head, encoder
+        self.distribution_class, self.copies = distribution_class, copies
         self.level_keys = list(encoder.in_keys) if encoder is not None else []
         self.context_keys = list(encoder.out_keys) if encoder is not None else []
         self.step_keys = [key for key in head.in_keys if key not in self.context_keys]

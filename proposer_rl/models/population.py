@@ -66,10 +66,8 @@ class Population(nn.Module):
         members = [make() for _ in range(copies)]
         if next(members[0].buffers(), None) is not None:
             raise ValueError("a Population's network must not have buffers")
-        self.copies = copies
-        self.precision = precision
-        self.cores = cores
-        self.batched = batched
+        self.copies, self.precision = copies, precision
+        self.cores, self.batched = cores, batched
         # All names of each parameter, because layers may share it.
         places: dict[nn.Parameter, list[str]] = {}
         for prefix, module in members[0].named_modules():
