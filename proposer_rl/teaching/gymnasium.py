@@ -11,8 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from proposer_rl.settings import ArgumentError, within
-from proposer_rl.tasks.gymnasium.answers import entries
-from proposer_rl.tasks.gymnasium.attributes import mismatch, write_attribute
+from proposer_rl.tasks.gymnasium.environment import entries, mismatch, write_attribute
 from proposer_rl.tasks.parameters import SEED
 from proposer_rl.teaching.remote import TeacherClient
 from proposer_rl.teaching.teacher import Teacher
