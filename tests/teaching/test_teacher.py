@@ -363,13 +363,6 @@ def test_many_parameters_have_one_bin_each() -> None:
     assert level.keys() == ranges.keys()
 
 
-def test_spaces_take_arrays_and_choices_of_any_kind() -> None:
-    items = prl.Items(3, features=np.eye(3), target=torch.tensor([1, 1, 2]))  # type: ignore[arg-type]
-    torch.testing.assert_close(items.target_shares, torch.tensor([0.0, 2 / 3, 1 / 3]))
-    lists = prl.Parameters({"size": [[1, 2], [3, 4]]}, target={"size": [[3, 4]]})
-    assert lists.target_shares.tolist() == [0, 1]
-
-
 def test_every_update_has_draws_of_its_own() -> None:
     """One ``Streams(0)`` at each update gives the same levels for ever; here there is none."""
     teacher = prl.Teacher(prl.curricula.domain_randomization(), SPACE)
