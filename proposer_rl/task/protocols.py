@@ -259,10 +259,22 @@ def space_features(space: Any, levels: Levels) -> Tensor:
         )
     parts = [torch.ones_like(c[..., :1]), c, c.square()]
     if space.size <= MANY_BINS:
-        places = space.coordinates.double()
-        nearest = torch.cdist(c.flatten(0, -2), places).argmin(-1).view(c.shape[:-1])
-        parts.append(torch.nn.functional.one_hot(nearest, len(places)).double())
+        parts.append(torch.nn.functional.one_hot(nearest_bins(space, c), space.size).double())
     return torch.cat(parts, -1)
+
+
+def nearest_bins(space: Space, places: Tensor) -> Tensor:
+    """Returns the bins of a space that are nearest to places in it.
+
+    Args:
+        space: with axes.
+        places: as its ``coordinates``, float [*B, D] on the CPU.
+
+    Returns:
+        int64 [*B].
+    """
+    distances = torch.cdist(places.double().flatten(0, -2), space.coordinates.double())
+    return distances.argmin(-1).view(places.shape[:-1])
 
 
 def level_inputs(space: Any, levels: Levels) -> Tensor:
