@@ -9,11 +9,9 @@ import sys
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
-from threading import Barrier, local
 from typing import Any
 
 import numpy as np
@@ -24,7 +22,6 @@ from torch.utils.data import BatchSampler
 
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
-from proposer_rl.teaching import sampler as module
 from tests.host_reads import CountedReads
 from tests.teaching.conftest import Install
 from tests.teaching.counting import ITEMS, Counting, through_torch
@@ -220,33 +217,6 @@ def test_loaders_that_go_on_find_the_place(stateful: bool, install: Install) -> 
         assert [*begun, *train(sampler, loader, steps)] == whole
 
 
-class Ranks:
-    """torch.distributed in threads of this process."""
-
-    def __init__(self, world: int) -> None:
-        self.world, self.meet, self.said = world, Barrier(world, timeout=20), {}
-        self.local = local()
-
-    is_available = is_initialized = staticmethod(lambda: True)
-
-    def get_world_size(self) -> int:
-        return self.world
-
-    def all_gather_object(self, into: list[Any], mine: Any) -> None:
-        self.said[self.local.rank] = through_json(mine)
-        self.meet.wait()
-        into[:] = [self.said[rank] for rank in range(self.world)]
-        self.meet.wait()
-
-    def run(self, of_rank: Callable[[int], Any]) -> list[Any]:
-        def started(rank: int) -> Any:
-            self.local.rank = rank
-            return of_rank(rank)
-
-        with ThreadPoolExecutor(self.world) as pool:
-            return [*pool.map(started, range(self.world))]
-
-
 def of_rank(rank: int, world: int) -> list[int]:
     """What a rank's sampler draws, every second batch of which it plays, as accelerate's does.
 
@@ -263,42 +233,27 @@ def of_rank(rank: int, world: int) -> list[int]:
     return drawn
 
 
-def test_all_ranks_have_one_curriculum(monkeypatch: pytest.MonkeyPatch) -> None:
-    alone = of_rank(0, 1)
-    ranks = Ranks(2)
-    monkeypatch.setattr(module, "distributed", ranks)
-    assert ranks.run(lambda rank: of_rank(rank, 2)) == [alone, alone]
-
-
-def test_what_one_rank_is_refused_counts_on_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    ranks = Ranks(2)
-    monkeypatch.setattr(module, "distributed", ranks)
-
-    def refused(rank: int) -> None:
-        _, sampler = replayed(length=2)
-        items = [next(iter(sampler))] * 1
-        with pytest.raises(ArgumentError, match=r"success=2.0: must be from 0 to 1"):
-            sampler.tell(items, [2.0 * rank])
-        assert not sampler.state_dict()["came"]
-        sampler.drop(items)
-        assert not sampler.state_dict()["came"]  # both answers, one of each rank
-        _, sampler = replayed(seed=rank)
-        with pytest.raises(ArgumentError, match="teacher: has drawn other items on other ranks"):
-            sampler.tell([next(iter(sampler))], [1.0])
-
-    ranks.run(refused)
-
-
 def process(rank: int, folder: str) -> None:
     distributed.init_process_group(
         "gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=2
     )
-    Path(folder, f"{rank}").write_text(json.dumps(of_rank(rank, 2)))
+    drawn = of_rank(rank, 2)
+    _, sampler = replayed(length=2)
+    items = [next(iter(sampler))]
+    with pytest.raises(ArgumentError, match=r"success=2.0: must be from 0 to 1"):
+        sampler.tell(items, [2.0 * rank])  # that of one rank is wrong
+    assert not sampler.state_dict()["came"]
+    sampler.drop(items)
+    assert not sampler.state_dict()["came"]  # both answers, one of each rank
+    _, sampler = replayed(seed=rank)
+    with pytest.raises(ArgumentError, match="teacher: has drawn other items on other ranks"):
+        sampler.tell([next(iter(sampler))], [1.0])
+    Path(folder, f"{rank}").write_text(json.dumps(drawn))
     distributed.destroy_process_group()
 
 
-@pytest.mark.slow
-def test_processes_have_one_curriculum(tmp_path: Path) -> None:
+def test_all_ranks_have_one_curriculum_and_refuse_together(tmp_path: Path) -> None:
+    """In processes of torch.distributed; against one process that plays all of it."""
     multiprocessing.spawn(process, (str(tmp_path),), nprocs=2)
     drawn = [json.loads((tmp_path / f"{rank}").read_text()) for rank in range(2)]
     assert drawn == [of_rank(0, 1)] * 2
