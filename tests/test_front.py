@@ -315,7 +315,7 @@ def test_a_run_is_read_wherever_the_process_is_by_then(
 
 
 def test_the_package_that_is_named_as_a_tasks_file_says_so() -> None:
-    with pytest.raises(TypeError, match=r"see prl.tasks.from_gymnasium\(env_id, ...\)$"):
+    with pytest.raises(TypeError, match=r"call prl.tasks.from_gymnasium\(env_id, ...\)$"):
         prl.tasks.gymnasium(env_id="CartPole-v1")
 
 

@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from proposer_rl.cli.build import parts
 from proposer_rl.cli.config import RunConfig, read_config
 from proposer_rl.experiment.continued import ContinuedLevels
-from proposer_rl.experiment.side_by_side import SideBySide
+from proposer_rl.experiment.loop import SideBySide
 from proposer_rl.recipes import CONFIG_FOLDER, composed
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.runs.process import StopSignals
