@@ -112,7 +112,7 @@ WRONG_COMMANDS = [
     ),
     (
         ["task=cartpole", "+method=target", "+filter=learnability"],
-        "method=target needs a student with exact_performance: GymnasiumTask measures performance by",
+        "method=target needs a student with exact_performance: GymnasiumTask measures",
     ),
     (
         ["+method=perf_gain", *SMOKE, "proposer.action_repeat=2"],
