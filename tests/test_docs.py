@@ -19,6 +19,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 import proposer_rl as prl
 from proposer_rl.cli.eval import main as evaluate
 from proposer_rl.cli.groups import arranged
+from proposer_rl.cli.help import needs
 from proposer_rl.recipes import CONFIG_FOLDER, maker
 from proposer_rl.settings import check_names, schema
 from tests.commands import SMOKE, call, trained_run
@@ -31,6 +32,8 @@ PAGES = {
     for file in sorted(DOCS.rglob("*.md"))
     if file.parts[len(DOCS.parts)] != "api"
 }
+# A block of code, and its output if a block without a language follows.
+OUTPUT = r"^```python\n(.*?)^```$(?:\n\n^```\n(.*?)^```$)?"
 CONFIGURATION, LEVELS = PAGES["reference/configuration"], PAGES["how_to/levels"]
 
 
@@ -57,11 +60,14 @@ OTHERS = sorted({(program, words) for program, words in shown() if program != "t
 
 @pytest.mark.usefixtures("own_folder")
 @pytest.mark.parametrize("page", [page for page, text in PAGES.items() if blocks("python", text)])
-def test_the_code_runs(page: str) -> None:
+def test_the_code_runs_and_says_what_is_shown(
+    page: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The blocks of a page one after another, as a reader would type them."""
     names: dict[str, object] = {}
-    for block in blocks("python", PAGES[page]):
-        exec(block, names)
+    for code, shown in re.findall(OUTPUT, PAGES[page], re.DOTALL | re.MULTILINE):
+        exec(code, names)
+        assert capsys.readouterr().out.endswith(shown)
 
 
 def test_the_settings_exist(tmp_path: Path) -> None:
@@ -195,6 +201,14 @@ def test_every_example_is_on_the_site() -> None:
     shown = set(re.findall(r"^```\{literalinclude\} \.\./\.\./(\S+)$", text, re.MULTILINE))
     files = [*(ROOT / "examples").rglob("*.py"), *(ROOT / "examples").rglob("*.yaml")]
     assert shown == {str(path.relative_to(ROOT)) for path in files}
+
+
+def test_the_reference_says_of_each_method_what_its_file_says_that_it_needs() -> None:
+    rows = [line.split(" | ") for line in PAGES["reference/methods"].splitlines()]
+    cells = {name: row[2] for row in rows for name in re.findall(r"^\| \[?`(\w+)`", row[0])}
+    for name, needs_of in needs([CONFIG_FOLDER]).items():
+        for word in ("target", "exact evaluation", "gradients", "schedule", "items"):
+            assert (word in cells[name]) == (word in " ".join(needs_of)), (name, word)
 
 
 def test_every_method_scale_task_and_sweep_is_in_the_reference() -> None:
