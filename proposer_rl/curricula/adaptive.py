@@ -108,6 +108,7 @@ class AdaptiveMixture(Curriculum):
         times: candidates for each level of the bridge.
     """
 
+    optional_results = ("success",)
     state = (
         "_came",
         "_sums",
