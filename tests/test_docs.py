@@ -72,7 +72,7 @@ def test_the_code_runs_and_says_what_is_shown(
 
 def test_the_settings_exist(tmp_path: Path) -> None:
     """Every key and group of every bin/train in the pages, also of those that no test executes."""
-    for text in (README, CONFIGURATION, PAGES["how_to/gymnasium_environment"]):
+    for text in (README, *PAGES.values()):
         write_files(text, tmp_path)
     assert len(SETTINGS) > 40
     for words, own in sorted(SETTINGS):
