@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib.util
 import json
+import operator
 import re
 import shlex
 import sys
@@ -15,12 +17,13 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
 import proposer_rl as prl
 from proposer_rl.cli.eval import main as evaluate
 from proposer_rl.cli.groups import arranged
 from proposer_rl.cli.help import needs
-from proposer_rl.recipes import CONFIG_FOLDER, maker
+from proposer_rl.recipes import CONFIG_FOLDER, composed, maker
 from proposer_rl.settings import check_names, schema
 from tests.commands import SMOKE, call, trained_run
 from tests.committed import needs_results
@@ -209,6 +212,19 @@ def test_the_reference_says_of_each_method_what_its_file_says_that_it_needs() ->
     for name, needs_of in needs([CONFIG_FOLDER]).items():
         for word in ("target", "exact evaluation", "gradients", "schedule", "items"):
             assert (word in cells[name]) == (word in " ".join(needs_of)), (name, word)
+
+
+@pytest.mark.parametrize("page", ["reference/configuration", "how_to/resume"])
+def test_the_reference_has_the_defaults(page: str) -> None:
+    config = OmegaConf.to_container(composed(["method=perf_gain"]), resolve=True)
+    for keys, defaults in re.findall(r"^\| (`[a-z].*?`) \| (\S.*?) \| ", PAGES[page], re.MULTILINE):
+        first, *others = re.findall("`([^`]+)`", keys)
+        names = [first, *(first.rpartition(".")[0] + other for other in others)]
+        values = defaults.replace("`", "").split(", ")
+        if len(values) == len(names) and not re.search(r"\*|^hydra", first):
+            for name, value in zip(names, values, strict=True):
+                found = functools.reduce(operator.getitem, name.split("."), config)
+                assert str(found).replace("None", "null") == value, name
 
 
 def test_every_method_scale_task_and_sweep_is_in_the_reference() -> None:
