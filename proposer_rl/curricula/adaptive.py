@@ -29,10 +29,10 @@ deviation of the returns of failures over that of all returns, in units of DENSE
 
     c = clamp((OFTEN - u) / (OFTEN - SELDOM), 0, 1) (1 - d of uniform levels).
 
-With ``concentrate``, c moves the bridge's part q to MOST, its candidates to MANY times as many, and
-``low`` to LEAST. Where levels come back one by one, c is 0: few of them are near to the target, and
-the bridge would repeat them. The target's share rises later where rewards are sparse: HALF then is
-HALF d + SPARSE_HALF (1 - d), with d of levels of the target.
+With ``concentrate``, c moves the bridge's part q to MOST, its candidates to MANY times as many,
+``delta`` to MASTERED and ``low`` to LEAST. Where levels come back one by one, c is 0: there are few
+of them near to the target, and the bridge would repeat them. The target's share rises later where
+rewards are sparse: HALF becomes HALF d + SPARSE_HALF (1 - d), with d of levels of the target.
 
 A data set has items that come back, and nothing between two of them. There is nothing to be made,
 so that there are more candidates, all different, and learnability counts for more; and their
@@ -82,7 +82,7 @@ BRIDGE_LEAST, BRIDGE_AT_ONCE, BRIDGE_MOST = 0.2, 0.4, 0.8
 # Success on uniform levels up to which the bridge is concentrated, and from which on it is not; the
 # ratio of deviations from which on rewards are dense; and what is moved to where they are sparse.
 SELDOM, OFTEN, DENSE = 0.2, 0.4, 0.25
-MOST, MANY, LEAST, SPARSE_HALF = 0.95, 16, 0.05, 0.4
+MOST, MANY, MASTERED, LEAST, SPARSE_HALF = 0.95, 16, 0.5, 0.05, 0.4
 SOON, LATER = 6.0, 20.0  # half-lives in batches: of sums, and of b where success falls again
 # Added to the sums of squares of predictions and labels that a correlation is of: a few say little.
 UNSURE = 0.05, 0.5
@@ -346,7 +346,8 @@ class AdaptiveMixture(Curriculum):
             p = self._belief.predict(x, items)
         else:
             p = self._belief.draw(x, items, draw)
-        allowed = p >= p.topk(count).values[-1].clamp(max=self._delta)
+        delta = self._delta + self._concentration * max(MASTERED - self._delta, 0)
+        allowed = p >= p.topk(count).values[-1].clamp(max=delta)
         bonus = ITEMS_LEARNABLE if self._is_data else LEARNABLE
         extra = torch.where(allowed, -bonus * 4 * p * (1 - p), FORBIDDEN)
         most, start = AT_ONCE if count <= LARGE else AT_ONCE // 2, 0
