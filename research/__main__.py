@@ -14,7 +14,6 @@ NAMES = {
     "prompts": "curricula of prompts for tiny language models, at equal rollouts",
     "loops": "curricula in training loops of TorchRL's stock parts",
     "scores": "finished runs on further levels, as a table of methods",
-    "publish": "finished runs as a study, for a repository",
     "pages": "the pages of a study: which curriculum to use, and which claims hold",
 }
 

@@ -13,28 +13,19 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from proposer_rl.curricula import (
-    Batch,
-    Curriculum,
-    ReplayCurriculum,
-    ReplayRule,
-    Scorer,
-    Student,
-    TaskStudent,
-)
+from proposer_rl import curricula as c
 from proposer_rl.curricula.contract import outcome_of_episodes
-from proposer_rl.experiment import Experiment, ScheduleSettings
 from proposer_rl.experiment.continued import ContinuedLevels
-from proposer_rl.experiment.side_by_side import SideBySide
+from proposer_rl.experiment.loop import SideBySide
 from proposer_rl.learning import PPOSettings, RolloutCollector, SolverSettings
-from proposer_rl.runs.folder import RunFolder
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.gymnasium.answers import SuccessSettings
 from proposer_rl.tasks.gymnasium.batched_env import plays
+from proposer_rl.tasks.gymnasium.environment import SuccessSettings
 from proposer_rl.tasks.gymnasium.player import LevelPlayer
 from tests.same_run import assert_same_run
 from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, walk_task
+from tests.test_experiment import experiment
 from tests.tiny import tiny_task, tiny_view_task
 
 K, P, T = 2, 3, 4
@@ -51,20 +42,20 @@ def continued_task(success: Any = None, **changed: Any) -> Any:
 TASK = continued_task()
 
 
-class Kept(Curriculum):
+class Kept(c.Curriculum):
     """Levels of the target; remembers what it has proposed and observed."""
 
     def __init__(self) -> None:
         self.proposed: list[Any] = []
-        self.observed: list[tuple[Batch, TensorDictBase]] = []
+        self.observed: list[tuple[c.Batch, TensorDictBase]] = []
 
-    def propose(self, student: Student, count: int, rng: Streams) -> Batch:
+    def propose(self, student: c.Student, count: int, rng: Streams) -> c.Batch:
         levels = TASK.target.sample(count, rng.generator("levels"))
         self.proposed.append(levels)
         notes = {"number": torch.full((count,), len(self.proposed)), "place": torch.arange(count)}
-        return Batch(levels, TensorDict(notes, [count]))
+        return c.Batch(levels, TensorDict(notes, [count]))
 
-    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+    def observe(self, student: c.Student, batch: c.Batch, outcome: TensorDictBase) -> None:
         self.observed.append((batch, outcome))
 
 
@@ -133,7 +124,7 @@ def test_each_episode_is_credited_to_its_level() -> None:
 def test_what_an_episode_gives_does_not_depend_on_those_beside_it() -> None:
     """Episodes of several lengths are filled up to one rollout; what fills them counts nowhere."""
     learner = TASK.learner([Streams(0)])
-    student = TaskStudent(TASK, learner)
+    student = c.TaskStudent(TASK, learner)
     levels, draws = TASK.evaluated_on["target"][: 2 * P], torch.Generator()
     whole: Any = torch.cat([student.play(some, draws) for some in levels.split(P)])
     ends = whole["next", "done"].squeeze(-1).long().argmax(-1) + 1
@@ -181,7 +172,7 @@ def test_whoever_reads_a_level_once_cannot_go_on() -> None:
 def test_others_watch_whole_episodes_elsewhere() -> None:
     """What a score plays leaves the episodes of the training where they are."""
     learner = TASK.learner([Streams(seed) for seed in SEEDS])
-    student = TaskStudent(TASK, learner, 1)
+    student = c.TaskStudent(TASK, learner, 1)
     assert isinstance(learner.collector, RolloutCollector)
     levels = TASK.evaluated_on["target"]
     generators = [torch.Generator().manual_seed(seed) for seed in SEEDS]
@@ -210,34 +201,19 @@ def remembering() -> Any:
     return tiny_view_task(solver=SolverSettings(batch_size=P, ppo=ppo))
 
 
-def experiment(folder: Path, updates: int, task: Any) -> Experiment:
-    learner = task.learner([Streams(seed, "solver") for seed in SEEDS])
-    rule = ReplayRule(prioritization="rank", temperature=0.3, best=None, staleness=0.1)
-    scorer = Scorer("positive_value_loss", "episodes")
-    curricula = [ReplayCurriculum(task.space, scorer, rule, capacity=8) for _ in SEEDS]
-    return Experiment(
-        task,
-        learner,
-        curricula,
-        schedule=ScheduleSettings(
-            updates=updates,
-            cycle_length=5,
-            evaluate_every=5,
-            checkpoint_every=3,
-            checkpoint_seconds=None,
-            headline=task.metrics[0],
-        ),
-        seeds=SEEDS,
-        folder=RunFolder(folder),
-        progress=False,
-    )
+def run(folder: Path, updates: int, task: Any) -> None:
+    rule = c.ReplayRule(prioritization="rank", temperature=0.3, best=None, staleness=0.1)
+    scorer = c.Scorer("positive_value_loss", "episodes")
+    curricula = [c.ReplayCurriculum(task.space, scorer, rule, capacity=8) for _ in SEEDS]
+    lengths = {"updates": updates, "cycle_length": 5, "evaluate_every": 5, "threshold": 0.8}
+    experiment(folder, *SEEDS, curriculum=curricula, task=task, **lengths).run()
 
 
 @pytest.mark.parametrize("task", [walking, pytest.param(remembering, marks=pytest.mark.slow)])
 def test_a_resumed_run_goes_on_in_the_middle_of_its_episodes(task: Any, tmp_path: Path) -> None:
     for updates in (5, 9):
-        experiment(tmp_path / "resumed", updates, task()).run()
-    experiment(tmp_path / "whole", 9, task()).run()
+        run(tmp_path / "resumed", updates, task())
+    run(tmp_path / "whole", 9, task())
     assert_same_run(tmp_path / "resumed", tmp_path / "whole")
 
 

@@ -130,7 +130,7 @@ def test_one_checkpoint_of_a_run(run: Path, tmp_path: Path, evaluate) -> None:
     [
         (["nowhere"], "nowhere: holds no checkpoints; give a run's folder"),
         (["."], ".: holds no checkpoints; give a run's folder or a checkpoint"),
-        (["{run}/metrics.csv"], "is no run's folder: it has no config.json"),
+        (["{run}/metrics.csv"], "is not a run's folder: it has no config.json"),
         (
             ["{run}", "--levels", "mazes"],
             "--levels mazes: must be one of: shapes, small, a file ",
@@ -172,4 +172,4 @@ def test_checkpoints_that_do_not_fit_are_refused(run: Path, tmp_path: Path, eval
     assert code == 2 and said.count("\n") == 1 and damaged.name in said
     shutil.copy(sorted((run / "checkpoints").glob("*.pt"))[0], tmp_path / "alone.pt")
     code, said = evaluate(tmp_path / "alone.pt")
-    assert code == 2 and "is no run's folder: it has no config.json" in said
+    assert code == 2 and "is not a run's folder: it has no config.json" in said

@@ -7,26 +7,15 @@ from contextlib import nullcontext
 from itertools import pairwise
 from pathlib import Path
 from signal import SIG_DFL, SIGTERM, signal
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDictBase
 
-from proposer_rl.curricula import (
-    Batch,
-    Curriculum,
-    Filtered,
-    LearnedCurriculum,
-    LearningProgressCurriculum,
-    SamplingCurriculum,
-    Scorer,
-    SelectionCurriculum,
-    Student,
-    TaskStudent,
-    UnfitStudentError,
-    outcome_of,
-)
+from proposer_rl import curricula as c
+from proposer_rl.curricula import SamplingCurriculum, Scorer, TaskStudent, outcome_of
 from proposer_rl.experiment import Experiment, ScheduleSettings
 from proposer_rl.learning import PPO, PPOSettings, SolverSettings
 from proposer_rl.runs.checkpoint import CheckpointError, load_latest
@@ -34,9 +23,10 @@ from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl
 from proposer_rl.runs.process import Interrupted, StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels, NoSuccessError, Task
+from proposer_rl.tasks.mazes.levels import shortest_path_length
 from proposer_rl.teaching import Teacher
 from tests.curricula.made import MADE
-from tests.same_run import StopAt, assert_same_run
+from tests.same_run import StopAt, assert_same_run, tables
 from tests.tasks.gymnasium.toys import walk_task
 from tests.tiny import TASK, mountain_cars
 
@@ -49,15 +39,17 @@ def learner(*seeds: int, task: Task = TASK) -> PPO:
 
 
 def experiment(
-    path: Path, *seeds: int, curriculum: Curriculum | None = None, task: Task = TASK, **options
+    path: Path, *seeds: int, curriculum: Any = None, task: Task = TASK, **options: Any
 ) -> Experiment:
+    """A run of several seeds needs a curriculum each, or draws from the target."""
     lengths = {key: options.pop(key) for key in list(options) if hasattr(ScheduleSettings, key)}
-    lengths = {"headline": task.metrics[0], **lengths}
+    lengths = {"headline": task.metrics[0], "threshold": 0.1, **LENGTHS, **lengths}
+    given = curriculum if isinstance(curriculum, list) else [curriculum]
     return Experiment(
         task,
         learner(*seeds, task=task),
-        [curriculum or SamplingCurriculum(task.target) for _ in seeds],
-        schedule=ScheduleSettings(**{"threshold": 0.1, **LENGTHS, **lengths}),
+        given if curriculum else [SamplingCurriculum(task.target) for _ in seeds],
+        schedule=ScheduleSettings(**lengths),
         seeds=seeds,
         folder=RunFolder(path),
         progress=False,
@@ -89,7 +81,11 @@ def test_a_run_is_a_plain_loop_of_updates(plain: tuple[Experiment, dict, Path]) 
     assert summary["updates_to_threshold"] == [first]
     assert summary["frames"] == 5 * P * T
     assert summary["curriculum_frames"] == summary["evaluations"] == 0
-    assert not (folder / "cycles.jsonl").exists()
+    # The target is the last of the four bins, and nothing else is told of a cycle.
+    cycles = read_jsonl(folder / "cycles.jsonl")
+    assert [row["histogram"] for row in cycles] == [[[0, 0], [0, n * P]] for n in (2, 2, 1)]
+    costs = {"curriculum_frames": 0, "evaluations": 0}
+    assert [{**costs, **row} for row in cycles] == cycles and len(cycles[0]) == 5
 
 
 def test_a_teacher_in_a_plain_loop_trains_the_same_solvers(tmp_path: Path) -> None:
@@ -121,7 +117,7 @@ def test_the_paths_that_are_recorded_are_legal(plain: tuple[Experiment, dict, Pa
             assert ends == "G" or len(path) == 9
 
 
-class Costly(LearnedCurriculum):
+class Costly(c.LearnedCurriculum):
     """Notes what it is called for, and says that all of it has a price."""
 
     state: tuple[str, ...] = ("observed",)
@@ -152,29 +148,23 @@ class Costly(LearnedCurriculum):
         return {"observed": observed} if observed else {}
 
 
+class Demanding(SamplingCurriculum):
+    needs = ("optimal_return",)
+
+
 def test_a_student_that_lacks_something_is_refused_before_anything_is_written(
     tmp_path: Path,
 ) -> None:
-    class Demanding(SamplingCurriculum):
-        needs = ("optimal_return",)
-
     cars = mountain_cars()
-    with pytest.raises(UnfitStudentError, match="Demanding needs a student with optimal_return"):
-        Experiment(
-            cars,
-            cars.learner([Streams(0)]),
-            [Demanding(cars.space)],
-            schedule=ScheduleSettings(**LENGTHS, headline=cars.metrics[0], threshold=0.5),
-            seeds=[0],
-            folder=RunFolder(tmp_path / "run"),
-        )
+    with pytest.raises(c.UnfitStudentError, match="Demanding needs a student with optimal_return"):
+        experiment(tmp_path / "run", 0, curriculum=Demanding(cars.space), task=cars)
     assert not list((tmp_path / "run").iterdir())
 
 
 class Told(SamplingCurriculum):
     """Keeps the returns that it is told."""
 
-    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+    def observe(self, student: c.Student, batch: c.Batch, outcome: TensorDictBase) -> None:
         self.returns = [*getattr(self, "returns", []), *outcome["return"].flatten().tolist()]
 
 
@@ -197,10 +187,10 @@ def test_success_of_a_task_that_has_none_is_refused_before_anything_is_written(
 ) -> None:
     monkeypatch.setattr(TASK, "results", ("return",))
     scorer = Scorer("learnability", "episodes")
-    reader: Curriculum = {
-        "outcomes": LearningProgressCurriculum(TASK.space, source="episodes"),
-        "plays of candidates": SelectionCurriculum(TASK.target, scorer, candidates=4, keep=2),
-        "plays before a filter": Filtered(SamplingCurriculum(TASK.target), scorer),
+    reader: c.Curriculum = {
+        "outcomes": c.LearningProgressCurriculum(TASK.space, source="episodes"),
+        "plays of candidates": c.SelectionCurriculum(TASK.target, scorer, candidates=4, keep=2),
+        "plays before a filter": c.Filtered(SamplingCurriculum(TASK.target), scorer),
     }[reads]
     with pytest.raises(NoSuccessError, match=f"{type(reader).__name__}: reads success"):
         experiment(tmp_path, 0, curriculum=reader, headline="id_return", threshold=-0.1)
@@ -254,7 +244,36 @@ def test_what_a_curriculum_costs_is_counted_written_and_survives(
         row["own"] = ["improved"]
     for row, observed in zip(expected[1:], (2, 2, 1), strict=True):
         row["observed"] = observed
+        row["histogram"] = [[0, 0], [0, observed * P]]
     assert cycles == expected
+
+
+def test_where_the_levels_of_a_cycle_lie_is_recorded(tmp_path: Path) -> None:
+    """Of levels that no curriculum's own record tells; in a run that goes on, too."""
+    for updates in (3, 5):
+        uniform = SamplingCurriculum(TASK.space)
+        experiment(tmp_path, 3, curriculum=uniform, updates=updates, cycle_length=4).run()
+    expected = np.zeros((2, 2), int)
+    for update in range(5):
+        if update == 4:
+            expected[:] = 0
+        stream = Streams(3, "update", update).generator("levels")
+        for level in TASK.space.sample(P, stream):
+            far = int(shortest_path_length(level)) > 3  # of 2 and 4
+            expected[int(float(level.walls.float().mean()) > 0.1), int(far)] += 1
+        if update == 3:
+            first = expected.tolist()
+    rows = [row["histogram"] for row in read_jsonl(tmp_path / "cycles.jsonl")]
+    assert rows == [first, expected.tolist()]
+
+
+def test_what_a_curriculum_tells_of_its_proposals_stays(tmp_path: Path) -> None:
+    class Tells(SamplingCurriculum):
+        def log(self) -> dict:
+            return {"histogram": [[1, 2], [3, 4]]}
+
+    experiment(tmp_path, 0, curriculum=Tells(TASK.target)).run()
+    assert read_jsonl(tmp_path / "cycles.jsonl")[-1]["histogram"] == [[1, 2], [3, 4]]
 
 
 def test_a_longer_schedule_goes_on_as_if_it_had_been_so_long_from_the_start(
@@ -331,23 +350,18 @@ def test_a_checkpoint_of_another_population_is_refused(tmp_path: Path) -> None:
         experiment(tmp_path, 0).run()
 
 
-def test_a_threshold_is_reached_by_being_met(tmp_path: Path) -> None:
-    rows = _rows(experiment(tmp_path / "before", 7))
-    best = max(rows, key=lambda row: row["id_success"])  # the first of equals
-    for name, threshold, reached in (
-        ("met", best["id_success"], best["updates"]),
-        ("rounded", np.nextafter(np.float32(best["id_success"]), 2), best["updates"]),
-        ("above", best["id_success"] + 1e-4, None),
-    ):
-        run = experiment(tmp_path / name, 7, threshold=float(threshold))
-        assert _rows(run) == rows
-        assert run.summary()["updates_to_threshold"] == [reached]
-
-
-def _rows(run: Experiment) -> list[dict[str, float]]:
-    """Of a whole run, without the seconds."""
-    run.run()
-    return [{**row, "seconds": 0} for row in read_csv(run.folder.path / "metrics.csv")]
+def test_a_threshold_is_reached_by_being_met(plain: Any, tmp_path: Path) -> None:
+    """That of a return may be any number."""
+    best = max(read_csv(plain[2] / "metrics.csv"), key=lambda row: row["id_success"])
+    met, updates = np.float32(best["id_success"]), best["updates"]
+    for number, (headline, threshold, reached) in enumerate([
+        ("success", met, updates), ("success", np.nextafter(met, 2), updates),
+        ("success", met + 1e-4, None), ("return", -1e6, 0), ("return", 1e6, None),
+    ]):  # fmt: skip
+        folder, asked = tmp_path / str(number), {"threshold": float(threshold)}
+        summary = experiment(folder, 7, headline=f"id_{headline}", **asked).run()
+        assert summary["updates_to_threshold"] == [reached]
+        assert tables(folder)["metrics.csv"] == tables(plain[2])["metrics.csv"]
 
 
 def test_rows_of_the_first_copy_are_logged(tmp_path: Path) -> None:
@@ -359,16 +373,3 @@ def test_rows_of_the_first_copy_are_logged(tmp_path: Path) -> None:
     rows = read_csv(tmp_path / "metrics.csv")
     expected = next(row for row in rows if row["updates"] == 5 and row["seed"] == 3)
     assert first["id_success"] == expected["id_success"]
-
-
-@pytest.mark.parametrize("threshold", [-1e6, 1e6])
-def test_a_return_may_be_asked_to_reach_any_number(tmp_path: Path, threshold: float) -> None:
-    summary = experiment(tmp_path, 0, headline="id_return", threshold=threshold).run()
-    assert summary["updates_to_threshold"] == [0 if threshold < 0 else None]
-
-
-def test_measuring_draws_nothing() -> None:
-    agent = learner(0).agent
-    before = torch.get_rng_state()
-    assert (TASK.measure(agent) == TASK.measure(agent)).all()
-    assert torch.equal(torch.get_rng_state(), before)

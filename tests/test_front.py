@@ -233,11 +233,11 @@ def test_what_cannot_be_imported_again_is_refused(tmp_path: Path) -> None:
     ("curriculum", "options", "message"),
     [
         ("plrr", {}, "curriculum='plrr': must be prl.curricula.NAME(...) or one of accel, adap"),
-        ("plr", {"scale": "tiny"}, "scale/tiny: unknown; choose one of"),
+        ("plr", {"scale": "tiny"}, "scale/tiny: unknown; there are:"),
         ("plr", {"seed": "x"}, "seed='x': input should be a valid integer"),
         ("plr", {"settings": {"slover": {}}}, "slover: unknown; there are: method"),
         ("plr", {"filter": {"times": 1}}, "filter.times=1"),
-        ("plr", {"filter": "lucky"}, "filter='lucky': must be one of ['learnability', "),
+        ("plr", {"filter": "lucky"}, "filter/lucky: unknown; there are: learnability, "),
         ("plr", {"settings": {"seed": object()}}, "seed=<object object at"),
         ("plr", {"updates": {1}}, "schedule={'updates': {1}}: must be a number, a text, a list"),
     ],
@@ -275,7 +275,7 @@ def test_what_is_no_run_names_what_was_given(task: Any, more: dict, message: str
 def test_settings_of_recipes_are_checked_where_they_are_given() -> None:
     with pytest.raises(prl.ArgumentError, match="temprature: unknown; there are: score, source"):
         prl.curricula.plr(temprature=1)
-    with pytest.raises(prl.ArgumentError, match=r"^temperature: unknown; there are none$"):
+    with pytest.raises(prl.ArgumentError, match=r"^temperature: unknown; there are: none$"):
         prl.curricula.target(temperature=1)
     with pytest.raises(prl.ArgumentError, match="env_id: missing"):
         recipe_function("task", "gymnasium")(max_steps=3)
@@ -293,7 +293,7 @@ def test_runs_in_threads_are_those_that_they_are_alone(tmp_path: Path) -> None:
         runs = list(pool.map(partial(train, "threads"), count(), methods))
     for seed, (method, run) in enumerate(zip(methods, runs, strict=True)):
         said = json.loads((run.folder / "run.json").read_text())
-        assert f"+method={method}" in said["overrides"] and said["settings"]["seed"] == seed
+        assert f"method={method}" in said["overrides"] and said["settings"]["seed"] == seed
         assert_same_run(run.folder, train("alone", seed, method).folder)
 
 
@@ -315,7 +315,7 @@ def test_a_run_is_read_wherever_the_process_is_by_then(
 
 
 def test_the_package_that_is_named_as_a_tasks_file_says_so() -> None:
-    with pytest.raises(TypeError, match=r"see prl.tasks.from_gymnasium\(env_id, ...\)$"):
+    with pytest.raises(TypeError, match=r"call prl.tasks.from_gymnasium\(env_id, ...\)$"):
         prl.tasks.gymnasium(env_id="CartPole-v1")
 
 

@@ -220,6 +220,7 @@ def test_pip_installs_it_in_a_new_environment(
         for command, *arguments in (
             ["proposer-train", "+method=perf_gain", "+scale=smoke", f"hydra.run.dir={run}"],
             ["proposer-report", run],
+            ["proposer-report", run, "--publish", "study"],
             ["python", "-I", "loop.py"],
         ):
             ended = subprocess.run(

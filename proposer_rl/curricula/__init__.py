@@ -1,4 +1,4 @@
-"""The curricula, and the parts to write one of your own.
+"""Curricula, and the parts from which you can write your own.
 
 The contract is in :mod:`~proposer_rl.curricula.contract`, what a curriculum may ask of a student in
 :mod:`~proposer_rl.curricula.student`. ``curricula.plr()``, ``curricula.currot()`` and so on are
@@ -50,7 +50,7 @@ from proposer_rl.recipes import Recipe, available, own_recipe, recipe_function
 
 
 def own(make: Callable[..., Any], **settings: Any) -> Recipe:
-    """Returns the recipe of a curriculum of one's own: :func:`proposer_rl.recipes.own_recipe`."""
+    """Returns a recipe for a curriculum of your own; see :func:`proposer_rl.recipes.own_recipe`."""
     return own_recipe("method", make, **settings)
 
 

@@ -128,6 +128,7 @@ class AdaptiveMixture(Curriculum):
             changes nothing for a data set, and where success is not told.
     """
 
+    optional_results = ("success",)
     state = (
         "_came",
         "_sums",

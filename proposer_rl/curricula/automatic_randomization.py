@@ -1,4 +1,4 @@
-"""Automatic domain randomization: bounds of each parameter that move by what is reached on them."""
+"""Automatic domain randomization (ADR): the range of each parameter widens with success."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from annotated_types import Interval
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
-from proposer_rl.curricula.contract import Batch, Curriculum
+from proposer_rl.curricula.bins import CountingCurriculum, Measure
+from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.points import Place, Points, refuse_crossed
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import Count, checked
@@ -20,8 +20,8 @@ from proposer_rl.task import Space
 INSIDE = -1  # of a point that lies on no bound
 
 
-class BoundsCurriculum(Curriculum):
-    """Draws levels uniformly within bounds, which move outwards where the student succeeds.
+class BoundsCurriculum(CountingCurriculum):
+    """Draws levels uniformly within bounds that move outwards where the student succeeds.
 
     A level is a point of the box [-1, 1]^D that the space's coordinates span. There are a lower and
     an upper bound of every coordinate, which begin at one point. A part of the levels lie on a
@@ -70,28 +70,28 @@ class BoundsCurriculum(Curriculum):
         rounded: bool = True,
     ) -> None:
         refuse_crossed(lower, upper)
-        self.space, self._points = space, Points(space, rounded)
+        super().__init__(space)
+        self._points = Points(space, rounded)
         self.required_results = ("success",) if measure == "success" else ()
         self._start, self._step = self._points.at(start), step
         self._lower, self._upper = lower, upper
         self._episodes, self._boundary, self._measure = episodes, boundary, measure
         # Of the numbers of bounds that move, 2 d and 2 d + 1 are coordinate d's.
         self._movable = (2 * self._points.free.unsqueeze(-1) + torch.arange(2)).flatten()
-        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self.bounds = self._start.expand(2, -1).mT.clone()
         # What the levels on each bound came to since it has moved, and how many, [2 D].
         self._sums = torch.zeros(2 * self._points.size, dtype=torch.float64)
         self._played = torch.zeros(2 * self._points.size, dtype=torch.int64)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Draws points within the bounds and on them, and returns levels [n] there."""
+        """Draws points within the bounds or on them, and returns the levels [n] there."""
         points, which, places = self._draw(count, rng.generator("choices"))
         levels, bins = self._points.levels(points, rng)
         return Batch(levels, TensorDict({"bins": bins, "bound": which, "at": places}, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Moves the bounds by what levels on them came to."""
-        self._counts += counts_of_bins(batch.notes["bins"], self.space)
+        """Moves the bounds by the results of the levels that lay on them."""
+        super().observe(student, batch, outcome)
         on_bound = batch.notes["bound"] != INSIDE
         reached = outcome[self._measure].double().cpu()
         seen = batch.notes["bound"], batch.notes["at"], reached
@@ -110,19 +110,18 @@ class BoundsCurriculum(Curriculum):
             each.copy_(each.new_tensor(now).view_as(each))
 
     def log(self) -> dict[str, Any]:
-        """Returns counts of levels by bin, the bounds, and the mean width between them."""
+        """Returns counts of levels by bin, the bounds, and their mean width."""
         if not bool(self._counts.any()):
             return {}
-        counts, self._counts = self._counts, torch.zeros_like(self._counts)
         widths = self.bounds.diff(dim=-1).squeeze(-1)[self._points.free]
         return {
-            "histogram": along_axes(counts, self.space),
+            "histogram": self.histogram(),
             "bounds": self.bounds.tolist(),
             "width": float(widths.mean()),
         }
 
     def _draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """Draws points [n, D]; returns the bounds [n] that they lie on, and their places."""
+        """Draws points [n, D], and returns which bound [n] each lies on and where that bound is."""
         bounds = self.bounds
         shares = torch.rand(count, len(bounds), generator=generator, dtype=torch.float64)
         points = bounds[:, 0].lerp(bounds[:, 1], shares)
@@ -134,7 +133,7 @@ class BoundsCurriculum(Curriculum):
         return points, which.where(on_bound, INSIDE), places
 
     def _moved(self, which: int, place: float, mean: float) -> float:
-        """Returns where a bound is after levels on it came to this in the mean."""
+        """Returns the new place of a bound, given the mean result of the levels on it."""
         axis, side = divmod(which, 2)
         outwards = self._step if side else -self._step
         move = outwards if mean >= self._upper else -outwards * (mean <= self._lower)

@@ -1,4 +1,4 @@
-"""Batches of levels, whatever a task takes as a level."""
+"""Copies, stores and compares batches of levels, whatever a task uses as a level."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MIX = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 
 
 class SomeBins:
-    """Levels of some of a space's bins, drawn uniformly.
+    """Draws levels uniformly from some of a space's bins.
 
     Args:
         space: with the bins.
@@ -30,7 +30,7 @@ class SomeBins:
         ArgumentError: for an axis or a value that the space does not have.
 
     Example:
-        >>> from proposer_rl.tasks.mazes.distributions import SpecificationSpace
+        >>> from proposer_rl.tasks.mazes.generation import SpecificationSpace
         >>> space = SpecificationSpace((0.0, 0.2), (2, 4, 6), height=6, width=6)
         >>> empty = SomeBins(space, {"obstacle fraction": [0.0]})
         >>> empty.bins
@@ -60,13 +60,13 @@ class SomeBins:
 
 
 def levels_in(space: Space, bins: Tensor, generator: torch.Generator) -> Levels:
-    """Returns levels [n] of a space's bins, int64 [n], one of each."""
+    """Returns one level [n] in each of the given bins, int64 [n]."""
     levels: Levels = space.generate(bins.unsqueeze(0), [generator])[0]
     return levels
 
 
 def saved(value: Any) -> Any:
-    """Returns an attribute as a state holds it: its own state, or a copy of what it consists of.
+    """Returns a copy of an attribute for a state: its own ``state_dict``, or copies of its parts.
 
     Numbers, texts, tensors, tensordicts and levels are copied, also in lists and dicts.
     """
@@ -82,7 +82,7 @@ def saved(value: Any) -> Any:
 
 
 def restored(state: Any, present: Any) -> Any:
-    """Returns the attribute that a state holds.
+    """Returns the attribute that a state holds; the inverse of :func:`saved`.
 
     An object with a state of its own is kept, and loads that. Levels, also those within a
     tensordict, become of the class and go to the device of those that are there at present, of
@@ -97,13 +97,13 @@ def restored(state: Any, present: Any) -> Any:
 
 
 def packed(entries: TensorDictBase) -> dict[str, Any]:
-    """Returns a copy of a tensordict in nested dicts, as a state holds it."""
+    """Copies a tensordict into nested dicts, as checkpoints store them."""
     state: dict[str, Any] = entries.clone().to_dict(convert_tensors=False)
     return state
 
 
 def unpacked(state: Mapping[str, Any], like: Any) -> Any:
-    """Returns the tensordict [m] that :func:`packed` put into a state.
+    """Rebuilds the tensordict [m] that :func:`packed` copied.
 
     It, and levels in it, become of the class and go to the device of ``like``.
     """
@@ -114,17 +114,12 @@ def unpacked(state: Mapping[str, Any], like: Any) -> Any:
         }
         made: Any = TensorDict(entries).auto_batch_size_(1)
     else:
-        made = of_kind(like, state).clone()
+        made = type(like).from_dict(state, batch_dims=1).clone()
     return moved(made, device_of(like)) if len([*like.keys(True, True)]) else made
 
 
-def of_kind(like: Levels, state: Mapping[str, Any]) -> Levels:
-    """Returns levels [m] of the class of ``like``, from nested dicts of their entries."""
-    return type(like).from_dict(state, batch_dims=1)
-
-
 def finite(name: str, numbers: Tensor) -> Tensor:
-    """Returns numbers as float64 on the CPU.
+    """Converts numbers to float64 on the CPU, and refuses NaN and infinity.
 
     Raises:
         ValueError: if they are not all finite.
@@ -144,12 +139,12 @@ def device_of(levels: Levels) -> torch.device:
 
 
 def moved(levels: Levels, device: torch.device) -> Levels:
-    """Returns levels on a device, without a copy where they are there already."""
+    """Moves levels to a device, without a copy if they are there already."""
     return levels if device_of(levels) == device else levels.to(device)
 
 
 def level_keys(levels: Any) -> Tensor:
-    """Returns a number for each of levels [*B], the same for equal levels only: int64 [*B].
+    """Hashes each of levels [*B] to a number that only equal levels share: int64 [*B].
 
     Hashes of the bytes of all entries, eight at a time: two levels collide with a probability of
     about 2^-64. Each eight go through the finalizer of SplitMix64 (Steele et al. 2014).

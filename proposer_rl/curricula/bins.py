@@ -1,4 +1,4 @@
-"""The base of curricula that draw from the bins of a space, and measurements of each bin."""
+"""Bases of curricula that draw from the bins of a space, and measurements of each bin."""
 
 from __future__ import annotations
 
@@ -21,8 +21,31 @@ from proposer_rl.task import NoSuccessError, Space, refuse_unfit_bins
 Measure = Literal["success", "return"]
 
 
-class BinCurriculum(Curriculum):
-    """Draws batches from shares of the bins, which it renews now and then in a scoring pass.
+class CountingCurriculum(Curriculum):
+    """Counts how many levels of each bin were observed, for the log.
+
+    The notes of its batches have the ``bins`` of the levels, int64 [n].
+
+    Args:
+        space: that has the bins.
+    """
+
+    def __init__(self, space: Space) -> None:
+        self.space = space
+        self._counts = torch.zeros(space.size, dtype=torch.int64)
+
+    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
+        """Counts the levels."""
+        self._counts += batch.notes["bins"].bincount(minlength=self.space.size)
+
+    def histogram(self) -> list[Any]:
+        """Returns the counts since the last call, as lists nested along the axes of the space."""
+        counts, self._counts = self._counts, torch.zeros_like(self._counts)
+        return along_axes(counts, self.space)
+
+
+class BinCurriculum(CountingCurriculum):
+    """Draws batches from shares of the bins, which regular scoring passes renew.
 
     A subclass says what a scoring pass is, what the shares are made of, and what is learnt from
     outcomes.
@@ -39,9 +62,8 @@ class BinCurriculum(Curriculum):
     @checked
     def __init__(self, space: Space, *, every: Count) -> None:
         refuse_unfit_bins(space)
-        self.space, self._every = space, every
-        self._proposed = 0
-        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
+        super().__init__(space)
+        self._every, self._proposed = every, 0
         self.scores: dict[str, Tensor] = {}  # what the shares come from, each [N], on the CPU
 
     @abstractmethod
@@ -50,10 +72,10 @@ class BinCurriculum(Curriculum):
 
     @abstractmethod
     def shares(self) -> Tensor:
-        """Returns the shares of the bins in the next batch, float [N], which add up to one."""
+        """Returns the shares of the bins in the next batch: float [N] with a sum of one."""
 
     def learn(self, bins: Tensor, outcome: TensorDictBase) -> None:
-        """Learns from the outcome [m] of levels in bins int64 [m]."""
+        """Learns from the outcome [m] of levels in these bins, int64 [m]."""
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
         """Draws levels [n] systematically from the shares of the bins."""
@@ -65,42 +87,30 @@ class BinCurriculum(Curriculum):
         return Batch(levels, TensorDict({"bins": bins}, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Counts the levels, and learns from what came of them."""
-        bins = batch.notes["bins"]
-        self._counts += counts_of_bins(bins, self.space)
-        self.learn(bins, outcome)
+        """Counts the levels and learns from their outcome."""
+        super().observe(student, batch, outcome)
+        self.learn(batch.notes["bins"], outcome)
 
     def log(self) -> dict[str, Any]:
         """Returns counts of levels by bin, the scores, and how even the shares are."""
         if not self.scores:
             return {}
-        shares, counts = self.shares(), self._counts
-        self._counts = torch.zeros_like(counts)
+        shares = self.shares()
         return {
-            "histogram": along_axes(counts, self.space),
+            "histogram": self.histogram(),
             **{name: along_axes(self.scores[name], self.space) for name in self.shown},
             "share_entropy": float(torch.special.entr(shares).sum()),
             "effective_bins": float(1 / shares.square().sum()),
         }
 
 
-def counts_of_bins(bins: Tensor, space: Space) -> Tensor:
-    """Counts the levels of each of a space's N bins: int64 [N].
-
-    Args:
-        bins: of the levels, int64 of any shape.
-        space: that has the bins.
-    """
-    return bins.flatten().bincount(minlength=space.size)
-
-
 def along_axes(values: Tensor, space: Space) -> list[Any]:
-    """Returns numbers [*B, N] of a space's bins as lists that are nested along its axes."""
+    """Nests numbers [*B, N] of a space's bins into lists along its axes."""
     return values.unflatten(-1, [len(axis) for axis in space.axes.values()]).tolist()
 
 
 def means_of_bins(choices: Tensor, values: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Returns the mean value of the levels of each bin, and how many levels it had.
+    """Returns the mean value of the levels in each bin, and how many levels each bin had.
 
     Args:
         choices: bins of the levels, int64 [n].
@@ -120,7 +130,7 @@ def means_of_bins(choices: Tensor, values: Tensor, size: int) -> tuple[Tensor, T
 
 
 class Probes:
-    """Fixed levels of every bin, on which the student's performance is measured.
+    """Measures the student's performance on fixed levels of every bin.
 
     The levels are drawn at the first time, from the streams of that proposal, and stay. What is
     measured is exact where the student's performance is.
@@ -158,10 +168,10 @@ class Probes:
         return reached.float().cpu()
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the address of the streams that the levels are drawn from."""
+        """Returns the address of the random streams from which the levels are drawn."""
         return {"drawn_from": list(self._drawn_from)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned; the levels are then drawn again."""
+        """Restores what :meth:`state_dict` returned; the levels are then drawn again."""
         self._levels = None
         self._drawn_from = list(state["drawn_from"])

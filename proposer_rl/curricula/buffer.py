@@ -1,4 +1,4 @@
-"""A buffer of N levels, and functions that change it.
+"""A buffer of N scored levels, and the functions that draw from it and change it.
 
 Prioritised level replay (Jiang et al. 2021, arXiv 2010.03934, section 3) keeps levels with a score
 of how much there is to learn on them, and draws them again from
@@ -16,28 +16,46 @@ scored, the *staleness weights*. A buffer is a tensordict [N] on the CPU:
   drawn or scored; it is the entry ``clock``, the same in all slots;
 - ``key`` int64: equal for equal levels; ``parent``: that of the level that it was edited from, 0
   for none; ``generation`` int64: edits since a level that was generated; ``draws`` int64.
+
+Slots are changed level by level, with NumPy, because a level is only a few numbers: ``numbers`` are
+entries of the buffer by name, arrays [N] that are changed in place. A new score moves only the
+ranks between the old place and the new one, so a level costs microseconds instead of a sort of all
+N slots.
+
+More than :data:`ONE_BY_ONE` levels, as thousands of environments ask for at once, are handled
+together: all are drawn by the shares before the first of them, and the best new levels replace
+those that are least likely to be drawn.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from proposer_rl.curricula.batches import CPU, level_keys, moved
-from proposer_rl.curricula.slots import Floats, draw_row, insert_row
 from proposer_rl.settings import Count, Positive, Share, settings
 
 Prioritization = Literal["rank", "proportional", "softmax"]
+Numbers = Mapping[str, NDArray[Any]]
+Floats = NDArray[np.float64]
+Places = NDArray[np.int64]
+Weigh = Callable[[Floats], Floats]
+"""Shares by rank, adding up to one, of scores that fall."""
+
+ONE_BY_ONE = 128
 
 
 @settings
 class ReplayRule:
-    """The rule by which levels are drawn from a buffer.
+    """Says how levels are drawn from a buffer.
 
     Attributes:
         prioritization: what the score weights depend on. ``rank``: r^(-1/T) of the r-th best score;
@@ -55,7 +73,7 @@ class ReplayRule:
 
 
 def empty_buffer(level: Any, capacity: int) -> TensorDict:
-    """Returns an empty buffer [capacity] for levels of the kind of the given one, []."""
+    """Makes an empty buffer [capacity] for levels like the given one, []."""
     shape = (capacity,)
     numbers = ("touched", "clock", "key", "parent", "generation", "draws")
     return TensorDict(
@@ -72,7 +90,7 @@ def empty_buffer(level: Any, capacity: int) -> TensorDict:
 
 
 def score_weights(score: Tensor, filled: Tensor, rule: ReplayRule) -> Tensor:
-    """Returns the shares of the levels by their scores; they add up to 1 where there is any level.
+    """Returns the shares of the levels by their scores; the sum is 1 unless all slots are empty.
 
     Args:
         score: float [*B, N].
@@ -94,7 +112,7 @@ def score_weights(score: Tensor, filled: Tensor, rule: ReplayRule) -> Tensor:
 
 
 def shares_by_rank(falling: Tensor, count: Tensor, rule: ReplayRule) -> Tensor:
-    """Returns the shares of the best score, the second best and so on: float64 [*B, N].
+    """Returns the shares of scores in falling order: float64 [*B, N].
 
     Args:
         falling: the scores, float64 [*B, N].
@@ -121,18 +139,12 @@ def shares_by_rank(falling: Tensor, count: Tensor, rule: ReplayRule) -> Tensor:
 
 @lru_cache(8)
 def _by_rank(count: int, temperature: float) -> Tensor:
-    """Returns r^(-1/T) of ranks r = 1 to ``count``, float64, which nobody may change."""
+    """Returns r^(-1/T) of the ranks r = 1 to ``count``, float64. Shared: do not change it."""
     return torch.arange(1, count + 1).double() ** (-1 / temperature)
 
 
-def staleness_weights(age: Tensor, filled: Tensor) -> Tensor:
-    """Returns shares in proportion to ages int64 [*B, N], equal ones if all ages are 0: float64."""
-    weight = age.double().where(filled, 0.0)
-    return _shares(weight.where(weight.sum(-1, keepdim=True) > 0, filled.double()))
-
-
 def replay_weights(score: Tensor, age: Tensor, filled: Tensor, rule: ReplayRule) -> Tensor:
-    """Returns the probability of each slot to be drawn: float64 [*B, N], zero for empty slots.
+    """Returns the probability that each slot is drawn, 0 for empty slots: float64 [*B, N].
 
     Args:
         score: float [*B, N].
@@ -140,8 +152,9 @@ def replay_weights(score: Tensor, age: Tensor, filled: Tensor, rule: ReplayRule)
         filled: bool [*B, N].
         rule: of the draws.
     """
-    by_score, by_age = score_weights(score, filled, rule), staleness_weights(age, filled)
-    return (1 - rule.staleness) * by_score + rule.staleness * by_age
+    stale = age.double().where(filled, 0.0)
+    by_age = _shares(stale.where(stale.sum(-1, keepdim=True) > 0, filled.double()))
+    return (1 - rule.staleness) * score_weights(score, filled, rule) + rule.staleness * by_age
 
 
 def draw_slots(
@@ -150,7 +163,7 @@ def draw_slots(
     rule: ReplayRule,
     generator: torch.Generator,
 ) -> Tensor:
-    """Draws levels one after another: each draw advances the clock and makes its level fresh.
+    """Draws levels one after another; each draw advances the clock and resets the age of its level.
 
     Args:
         buffer: with a level in some slot.
@@ -170,7 +183,7 @@ def draw_slots(
 
 
 def insert(buffer: TensorDictBase, new: TensorDictBase, rule: ReplayRule) -> None:
-    """Inserts levels that were scored, one after another.
+    """Inserts scored levels one after another.
 
     A level that is there already gets its new score. Another one gets the next free slot; where
     there is none, that of the level that is least likely to be drawn, if its score is higher than
@@ -218,7 +231,7 @@ def rescore(
     best: Tensor,
     reached: Tensor | None = None,
 ) -> None:
-    """Replaces the scores of levels that were drawn by new ones.
+    """Replaces the scores of levels that were drawn.
 
     Args:
         buffer: [N].
@@ -236,7 +249,7 @@ def rescore(
 
 
 def lineage(buffer: TensorDictBase, most: int) -> Tensor:
-    """Returns the slots of the longest line of levels, each edited from the one before: int64 [m].
+    """Returns the slots of the longest chain of edits, from ancestor to descendant: int64 [m].
 
     Args:
         buffer: [N].
@@ -255,7 +268,7 @@ def lineage(buffer: TensorDictBase, most: int) -> Tensor:
 
 
 def _mean_of_slots(old: Tensor, slots: Tensor, new: Tensor) -> Tensor:
-    """Returns for each slot the mean of what is new and finite in it, or its old value: [*B, N].
+    """Returns the mean of the finite new values of each slot, or else its old value: [*B, N].
 
     Args:
         old: values of all slots, [*B, N].
@@ -275,7 +288,7 @@ def _numbers(entries: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _of_equals(key: Tensor, score: Tensor, best: Tensor) -> tuple[Tensor, Tensor]:
-    """Gives equal levels one score, the mean of the finite ones, and one highest return: [M]."""
+    """Gives equal levels the mean of their finite scores, and their highest return: [M]."""
     groups, group = key.unique(return_inverse=True)
     unknown = torch.full((len(groups),), torch.nan, dtype=torch.float64)
     mean = _mean_of_slots(unknown, group, score)
@@ -285,3 +298,176 @@ def _of_equals(key: Tensor, score: Tensor, best: Tensor) -> tuple[Tensor, Tensor
 
 def _shares(weight: Tensor) -> Tensor:
     return weight / weight.sum(-1, keepdim=True).clamp_min(torch.finfo(weight.dtype).tiny)
+
+
+def draw_row(
+    numbers: Numbers, by_score: Floats, staleness: float, noise: Floats
+) -> NDArray[np.int64]:
+    """Draws slots one after another; each draw advances the clock and resets the age of its level.
+
+    Args:
+        numbers: of a row with a level.
+        by_score: shares of the slots by their scores, [N].
+        staleness: share of the draws that go by age.
+        noise: uniform in [0, 1), [P].
+
+    Returns:
+        The slots, int64 [P].
+    """
+    touched, filled = numbers["touched"], numbers["filled"]
+    clock, last = int(numbers["clock"][0]), len(filled) - 1
+    by_score = (1 - staleness) * by_score.cumsum()
+    count = filled.cumsum().astype(np.float64)
+    ages = ((clock - touched) * filled).cumsum().astype(np.float64)  # whole numbers
+    slots, shares = np.empty(len(noise), np.int64), np.empty_like(count)
+    some = 1 if len(noise) <= ONE_BY_ONE else len(noise)
+    for start in range(0, len(noise), some):
+        marks = noise[start : start + some]
+        old = ages if ages[-1] > 0 else count
+        np.multiply(old, staleness / old[-1], out=shares)
+        shares += by_score
+        # An empty slot adds nothing to the sum, so that no mark lies in it.
+        which = np.minimum(shares.searchsorted(marks * shares[-1], "right"), last)
+        slots[start : start + some] = which
+        ages += count
+        ages[which[0] :] -= clock + 1 - touched[which[0]]
+        touched[which] = clock + np.arange(1, some + 1)
+        clock += some
+    numbers["clock"][:] = clock
+    return slots
+
+
+class Ranks:
+    """Keeps the slots in order of falling score, with their shares; ties go to the earlier slot.
+
+    Args:
+        score: of all slots, [N], which :meth:`change` changes.
+        weigh: shares by rank.
+        by_rank: whether these are the same whatever the scores are, as long as two of them differ.
+    """
+
+    def __init__(self, score: Floats, weigh: Weigh, by_rank: bool) -> None:
+        self._score, self._weigh, self._by_rank = score, weigh, by_rank
+        self._slots = np.argsort(-score, kind="stable")
+        self._falling = -score[self._slots]  # rising, as searchsorted takes it
+        self._table = weigh(-self._falling)
+        self._uniform = self._falling[0] == self._falling[-1]
+        self.shares = np.empty_like(self._table)
+        self.shares[self._slots] = self._table
+
+    def change(self, slot: int, score: float) -> None:
+        """Changes the score of a slot and renews the shares."""
+        old = self._place(slot, self._score[slot])
+        new = self._place(slot, score)
+        new -= new > old  # its own place does not count
+        for line, value in ((self._slots, slot), (self._falling, -score)):
+            if new < old:
+                line[new + 1 : old + 1] = line[new:old]
+            else:
+                line[old:new] = line[old + 1 : new + 1]
+            line[new] = value
+        self._score[slot] = score
+        uniform = self._falling[0] == self._falling[-1]
+        if self._by_rank and not uniform and not self._uniform:
+            moved = slice(min(old, new), max(old, new) + 1)
+        else:
+            self._table, moved = self._weigh(-self._falling), slice(None)
+        self.shares[self._slots[moved]] = self._table[moved]
+        self._uniform = uniform
+
+    def _place(self, slot: int, score: float) -> int:
+        """Returns how many slots rank before a slot with this score."""
+        first = int(self._falling.searchsorted(-score, "left"))
+        last = int(self._falling.searchsorted(-score, "right"))
+        return first + int(self._slots[first:last].searchsorted(slot))
+
+
+def insert_row(
+    numbers: Numbers, keys: Places, scores: Floats, staleness: float, weigh: Weigh, by_rank: bool
+) -> tuple[Places, Places]:
+    """Inserts levels into slots, one after another, or all at once if there are many.
+
+    Changes ``filled``, ``key``, ``score``, ``touched`` and ``clock``.
+
+    Args:
+        numbers: of the row.
+        keys: of the new levels, [M].
+        scores: of them; one that is not finite is not kept.
+        staleness: share of the draws that go by age.
+        weigh: shares by rank of scores that fall.
+        by_rank: see :class:`Ranks`.
+
+    Returns:
+        Which new level has gone into each slot, int64 [N], -1 for none; and slots and levels of
+        those that were there already, int64 [2, m].
+    """
+    if len(keys) > ONE_BY_ONE:
+        return _insert_at_once(numbers, keys, scores, staleness, weigh)
+    filled, key, score, touched = (numbers[n] for n in ("filled", "key", "score", "touched"))
+    clock = int(numbers["clock"][0])
+    place = dict(zip(key[filled].tolist(), filled.nonzero()[0].tolist(), strict=True))
+    free = iter((~filled).nonzero()[0].tolist())
+    source, again = np.full(len(filled), -1), []
+    ranks: Ranks | None = None
+    for i, (own, value) in enumerate(zip(keys.tolist(), scores.tolist(), strict=True)):
+        clock += 1
+        if not math.isfinite(value):
+            continue
+        slot = place.get(own, -1)
+        if slot >= 0:
+            again.append((slot, i))
+        else:
+            slot = next(free, -1)
+            if slot < 0:
+                ranks = ranks or Ranks(score, weigh, by_rank)
+                slot = int(_by_both(ranks.shares, clock - touched, staleness).argmin())
+                if not value > score[slot]:
+                    continue
+                del place[int(key[slot])]
+            filled[slot], key[slot], source[slot] = True, own, i
+            place[own] = slot
+        if ranks is None:
+            score[slot] = value
+        else:
+            ranks.change(slot, value)
+        touched[slot] = clock
+    numbers["clock"][:] = clock
+    return source, np.array(again, np.int64).reshape(-1, 2).T
+
+
+def _insert_at_once(
+    numbers: Numbers, keys: Places, scores: Floats, staleness: float, weigh: Weigh
+) -> tuple[Places, Places]:
+    """Inserts many levels at once, the best first."""
+    filled, key, score, touched = (numbers[n] for n in ("filled", "key", "score", "touched"))
+    clock, source = int(numbers["clock"][0]), np.full(len(filled), -1)
+    numbers["clock"][:] = clock + len(keys)
+    finite = np.flatnonzero(np.isfinite(scores))[::-1]
+    if not len(finite):
+        return source, np.empty((2, 0), np.int64)
+    own, last = np.unique(keys[finite], return_index=True)  # of equal ones the last
+    new, used = finite[last], np.flatnonzero(filled)
+    place = own.searchsorted(key[used]).clip(max=len(own) - 1)
+    there = own[place] == key[used]
+    again = np.stack([used[there], new[place[there]]])
+    score[again[0]], touched[again[0]] = scores[again[1]], clock + 1 + again[1]
+    new = np.delete(new, place[there])
+    new = new[np.argsort(-scores[new], kind="stable")]
+    slots = np.flatnonzero(~filled)
+    more = min(len(new) - len(slots), len(used))
+    if more > 0:
+        by_score = Ranks(score[used], weigh, by_rank=False).shares
+        shares = _by_both(by_score, clock + len(keys) - touched[used], staleness)
+        least = np.argpartition(shares, more - 1)[:more]
+        slots = np.concatenate([slots, used[least[np.argsort(shares[least], kind="stable")]]])
+    new, slots = new[: len(slots)], slots[: len(new)]
+    better = ~filled[slots] | (scores[new] > score[slots])
+    new, slots = new[better], slots[better]
+    filled[slots], key[slots], source[slots] = True, keys[new], new
+    score[slots], touched[slots] = scores[new], clock + 1 + new
+    return source, again
+
+
+def _by_both(by_score: Floats, age: Places, staleness: float) -> Floats:
+    """Returns the shares by score and age of slots that all hold a level: [N]."""
+    return by_score * (1 - staleness) + age * (staleness / max(int(age.sum()), 1))

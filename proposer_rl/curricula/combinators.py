@@ -1,4 +1,4 @@
-"""Curricula that are made of other curricula: filtered ones, one after another, several at once."""
+"""Curricula made of other curricula: filtered, one after another, or several at once."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from proposer_rl.streams import Streams
 
 
 class Combinator(LearnedCurriculum):
-    """The base of curricula that are made of others, to which it passes everything on.
+    """Passes every call on to the curricula that it is made of; the base of those below.
 
     Args:
         parts: the curricula.
@@ -32,19 +32,22 @@ class Combinator(LearnedCurriculum):
         self.required_results = tuple(
             dict.fromkeys(entry for part in parts for entry in part.required_results)
         )
+        self.optional_results = tuple(
+            dict.fromkeys(entry for part in parts for entry in part.optional_results)
+        )
         self.trains_replicas = any(part.trains_replicas for part in self._learned())
 
     def improve(self, student: Student, rng: Streams) -> dict[str, Any]:
-        """Improves the parts that train something."""
+        """Improves the parts that learn."""
         improved = [part.improve(student, rng) for part in self._learned()]
         return {key: value for metrics in improved for key, value in metrics.items()}
 
     def log(self) -> dict[str, Any]:
-        """Returns the logs of the parts in one; of entries that several have, the last one's."""
+        """Merges the logs of the parts; where several have an entry, the last part wins."""
         return {key: value for part in self.parts for key, value in part.log().items()}
 
     def learnt(self) -> dict[str, Any]:
-        """Returns what the last part has learnt that has learnt something."""
+        """Returns what the last part that learns has learnt."""
         return next(filter(None, (part.learnt() for part in reversed(self.parts))), {})
 
     def state_dict(self) -> dict[str, Any]:
@@ -52,7 +55,7 @@ class Combinator(LearnedCurriculum):
         return {**super().state_dict(), "parts": [part.state_dict() for part in self.parts]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned."""
         super().load_state_dict(state)
         for part, own in zip(self.parts, state["parts"], strict=True):
             part.load_state_dict(own)
@@ -67,23 +70,22 @@ class Combinator(LearnedCurriculum):
 
 
 class Filtered(Combinator):
-    """Draws several times as many levels from a curriculum, and keeps some by their scores.
+    """Draws several times as many levels as needed from a curriculum, and keeps some by score.
 
-    The n levels that are kept are drawn one after another, none of them twice, each in proportion
-    to
+    The n levels that are kept are drawn without replacement, each in proportion to
 
-        exp( score / temperature )
+        exp( score / temperature ).
 
-    of those that are left. With learnability p (1 - p) as the score, what is mastered and what is
-    out of reach gets the smallest shares, wherever the levels come from: the idea of SFL
-    (arXiv 2408.15099) and NCC (arXiv 2505.20659), which keep their candidates in a buffer. The
-    curriculum observes the levels that are kept as if it had proposed these alone.
+    With learnability p (1 - p) as the score, levels that are mastered or out of reach get the
+    smallest shares, wherever the levels come from. This is the idea of SFL (arXiv 2408.15099) and
+    NCC (arXiv 2505.20659), which keep their candidates in a buffer. The curriculum observes the
+    kept levels as if it had proposed only these.
 
     Args:
-        curriculum: that draws.
-        scorer: of its levels.
-        times: levels that are drawn for each that is kept.
-        temperature: of the draws among them, in units of the score.
+        curriculum: proposes the candidates.
+        scorer: scores them.
+        times: number of candidates for each level that is kept.
+        temperature: of the draws, in units of the score.
 
     Raises:
         ValueError: if the curriculum is :class:`Mixed`.
@@ -100,7 +102,7 @@ class Filtered(Combinator):
     ) -> None:
         super().__init__([curriculum])
         if _mixes(curriculum):
-            raise ValueError("filter the curricula of a mixture, each by itself, not the mixture")
+            raise ValueError("filter each curriculum of a mixture by itself, not the mixture")
         self.needs = tuple(dict.fromkeys((*self.needs, *scorer.needs)))
         self.required_results = tuple(dict.fromkeys((*self.required_results, *scorer.plays_for)))
         self._scorer, self._times, self._temperature = scorer, times, temperature
@@ -116,11 +118,11 @@ class Filtered(Combinator):
         rollouts: Count = 8,
         **settings: Any,
     ) -> Filtered:
-        """Makes it with a scorer of these settings: see :class:`Scorer`."""
+        """Makes it for a run, with a scorer of these settings; see :class:`Scorer`."""
         return cls(curriculum, Scorer(score, source, rollouts), **settings)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Draws a larger batch from the curriculum, and returns the levels of it that are kept."""
+        """Draws candidates from the curriculum, and returns the levels [n] that are kept."""
         candidates = proposed(self.parts[0], student, self._times * count, rng)
         scored = self._scorer(student, candidates.levels, rng, "choice")
         draw = rng.generator("choice")
@@ -128,18 +130,18 @@ class Filtered(Combinator):
         return Batch(kept.levels, kept.notes)
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Passes the outcome on to the curriculum that is filtered."""
+        """Passes the outcome on to the filtered curriculum."""
         self.parts[0].observe(student, batch, outcome)
 
 
 class Schedule(Combinator):
     """Follows one curriculum after another, as hand-designed ones do.
 
-    Its clock is the number of its own batches, so that it needs no count of the student's updates.
+    It counts its own batches, so it does not need to know the student's updates.
 
     Args:
         stages: curricula, in order.
-        until: number of batches after which each but the last ends, ascending.
+        until: number of batches after which each stage but the last ends, ascending.
 
     Raises:
         ArgumentError: if ``until`` is not ascending or does not fit the stages.
@@ -159,7 +161,7 @@ class Schedule(Combinator):
         self._proposed = 0
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Returns what the present stage proposes."""
+        """Returns what the current stage proposes."""
         stage = self._stage
         batch = proposed(self.parts[stage], student, count, rng)
         self._proposed += 1
@@ -167,13 +169,13 @@ class Schedule(Combinator):
         return Batch(batch.levels, TensorDict(notes, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Passes the outcome on to the stage that has proposed the levels."""
+        """Passes the outcome on to the stage that proposed the levels."""
         if len(batch):
             own = Batch(batch.levels, batch.notes["notes"], batch.size)
             self.parts[int(batch.notes["stage"][0])].observe(student, own, outcome)
 
     def improve(self, student: Student, rng: Streams) -> dict[str, Any]:
-        """Improves the stage that the cycle begins with."""
+        """Improves the stage that is current when the cycle begins."""
         part = self.parts[self._stage]
         return part.improve(student, rng) if isinstance(part, LearnedCurriculum) else {}
 
@@ -183,11 +185,11 @@ class Schedule(Combinator):
 
 
 class Mixed(Combinator):
-    """Makes batches of which every curriculum has its share.
+    """Fills each batch with a fixed share of levels from every curriculum.
 
     Args:
-        curricula: of one kind of levels.
-        shares: of the levels of a batch, not negative; rounded to whole levels so that they add up.
+        curricula: all with the same kind of levels.
+        shares: of each in a batch, not negative; rounded so that whole levels add up.
 
     Raises:
         ArgumentError: if there is not one share for each curriculum, or all are zero.
@@ -214,7 +216,7 @@ class Mixed(Combinator):
             if some
         }
         whose = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
-        # Every level has an entry for each curriculum; of another one than its own, any.
+        # Every level has notes of each curriculum; only those of its own are used.
         place = torch.cat([torch.arange(some) for some in counts])
         notes = {
             str(i): batch.notes[place.clamp(max=len(batch) - 1)] for i, batch in batches.items()
@@ -224,7 +226,7 @@ class Mixed(Combinator):
         return Batch(levels, TensorDict({"part": whose, "size": sizes, **notes}, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Gives every curriculum the outcome of what it has proposed."""
+        """Passes the outcome of each level on to the curriculum that proposed it."""
         whose, sizes = batch.notes["part"], batch.notes["size"]
         for i in whose.unique().tolist():
             own = (whose == i).nonzero().flatten()
@@ -232,7 +234,7 @@ class Mixed(Combinator):
             self.parts[i].observe(student, part, outcome[own])
 
     def log(self) -> dict[str, Any]:
-        """Returns the log of each curriculum, whose entries begin with its number."""
+        """Returns the logs of the parts, with the number of the part before each entry."""
         record: dict[str, Any] = {}
         levels: dict[str, Any] = {}
         for i, part in enumerate(self.parts):
@@ -248,12 +250,12 @@ def _mixes(curriculum: Curriculum) -> bool:
 
 
 def draw_without_replacement(logits: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Draws places one after another, in proportion to exp(logit) of those that are left.
+    """Draws places without replacement, each in proportion to exp(logit) of those left.
 
     The largest of the logits with Gumbel noise are such draws (Kool et al. 2019, arXiv 1903.06059).
 
     Args:
-        logits: float [M]; minus infinity for places that are only drawn where no other is left.
+        logits: float [M]; places with minus infinity are only drawn when no others are left.
         count: number n of draws.
         generator: of the CPU.
 

@@ -1,17 +1,17 @@
-"""The contract of a curriculum: all that its author reads.
+"""What you need to write a curriculum: the base class and its batches.
 
-A curriculum proposes levels to a student and observes how the student fared on them:
+A curriculum proposes levels to a student and observes the results:
 
     levels = curriculum.propose(student, count, rng)
     outcome = ...                                        # the student trains on the levels
     curriculum.observe(student, batch, outcome)
 
-It is for one student, and each of its levels is observed at most once, in the order in which they
-were proposed: the :class:`~proposer_rl.curricula.ledger.Ledger` of whoever calls it sees to that,
-whichever results come late, in parts or not at all. Several batches may be outstanding, so what a
-curriculum needs to recognise a level travels in the ``notes`` of a :class:`Batch`.
+A curriculum has one student. It observes each level at most once, in the order of the proposals:
+the caller's :class:`~proposer_rl.curricula.ledger.Ledger` takes care of that, even if results come
+late, in parts or not at all. Several batches may be outstanding, so a curriculum writes into the
+``notes`` of a :class:`Batch` what it needs to recognise the levels.
 
-n levels of a batch, m those of them that are observed together, T steps, N bins.
+Shapes: n levels in a batch, m of them observed together, T steps, N bins.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from proposer_rl.task import Levels
 
 @dataclass(frozen=True)
 class Batch:
-    """Levels that a curriculum has proposed, or a part of them, ``batch[some]``.
+    """Levels that a curriculum proposed, with notes about them; ``batch[some]`` is a part.
 
     Attributes:
         levels: [n], on the device of the task.
-        notes: a tensordict [n] on the CPU, by which the curriculum recognises the levels again;
-            None for none.
-        size: number of levels of the whole batch, of a part, too; None for n.
+        notes: a tensordict [n] on the CPU by which the curriculum recognises the levels; None for
+            no notes.
+        size: number of levels in the whole batch, also of a part; None for n.
 
     Raises:
-        ArgumentError: if there is not one note for each level.
+        ArgumentError: if the notes are not [n].
     """
 
     levels: Levels
@@ -72,19 +72,19 @@ class Batch:
 
 
 def outcome_of(rollout: TensorDictBase) -> TensorDict:
-    """Returns the outcome of levels, from TorchRL's rollout [n, T] on them.
+    """Computes the outcome of levels from a TorchRL rollout [n, T] on them.
 
-    Every outcome is a tensordict [n] with
+    Every outcome is a tensordict [n] with these entries:
 
-    - ``return`` float: undiscounted, of the first episode on the level, or the mean of those that a
-      loop has played there;
-    - ``success`` float in [0, 1], where there is such a thing: likewise;
-    - ``episodes`` and ``steps`` int64: how many episodes ended, and how long all of it was;
-    - ``rollout`` [n, T], where there is one, with ``state_value`` where there is a critic, and
-      ``is_step`` bool [n, T] where episodes are filled up to one length;
-    - ``score`` float, where the loop itself says how much there is to learn on a level.
+    - ``return`` float: undiscounted, of the first episode on the level, or the mean over the
+      episodes that a loop played there;
+    - ``success`` float in [0, 1]: likewise, if the task has a success;
+    - ``episodes`` and ``steps`` int64: how many episodes ended, and the steps of all of them;
+    - ``rollout`` [n, T]: if there is one, with ``state_value`` if there is a critic, and with
+      ``is_step`` bool [n, T] if episodes are padded to one length;
+    - ``score`` float: if the loop itself scores levels.
 
-    Only ``return`` must be there; a curriculum names others that it cannot do without, its
+    Only ``return`` is always there; a curriculum lists the others that it needs in its
     ``required_results``.
     """
     done = rollout["next", "done"].squeeze(-1)
@@ -102,10 +102,10 @@ def outcome_of(rollout: TensorDictBase) -> TensorDict:
 
 
 def outcome_of_episodes(episodes: Sequence[TensorDictBase]) -> TensorDict:
-    """Returns the outcome of levels [m] by the one episode [T] that was played on each.
+    """Computes the outcome of levels [m] from one episode [T] on each.
 
-    Shorter episodes are filled up with zeros to one rollout [m, T]; their entry ``is_step`` says
-    which steps were played.
+    Shorter episodes are padded with zeros to one rollout [m, T], whose entry ``is_step`` says which
+    steps were played.
     """
     longest = max(map(len, episodes))
     filled: list[Any] = [
@@ -116,78 +116,81 @@ def outcome_of_episodes(episodes: Sequence[TensorDictBase]) -> TensorDict:
 
 
 class Curriculum:
-    """The interface of curricula; of its methods only :meth:`propose` must be defined.
+    """The base class of curricula; only :meth:`propose` must be defined.
 
     Attributes:
-        needs: names of what it asks of a student; see :class:`~proposer_rl.curricula.Student`.
-        required_results: entries of an outcome, beside the return, that it cannot do without:
-            ``success``, ``rollout``.
-        state: names of its attributes that a resumed run needs: numbers, texts, tensors, lists
-            and dicts of these, and objects with a state of their own. Others are for
-            :meth:`state_dict`.
+        needs: names of the student's functions that it calls; see
+            :class:`~proposer_rl.curricula.Student`.
+        required_results: entries of an outcome that it needs besides the return: ``success``,
+            ``rollout``.
+        optional_results: entries of an outcome from which it learns more, where they are told.
+        state: names of the attributes that a resumed run needs. They may be numbers, texts,
+            tensors, lists and dicts of these, and objects with a ``state_dict``. Override
+            :meth:`state_dict` to save anything else.
     """
 
     needs: tuple[str, ...] = ()
     required_results: tuple[str, ...] = ()
+    optional_results: tuple[str, ...] = ()
     state: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def create(cls, run: Components, **settings: Any) -> Curriculum:
-        """Makes it for a run, as commands and :class:`~proposer_rl.Teacher` do.
+        """Makes the curriculum for a run; the command line, ``train`` and ``Teacher`` call it.
 
-        This one passes on the space of the task's levels. Override it to take something else of
-        the run: ``return cls(run.task.target, **settings)``.
+        By default the constructor gets the space of the task's levels. Override this method to pass
+        on another part of the run: ``return cls(run.task.target, **settings)``.
 
         Args:
             run: the task, and the Proposer's settings.
-            settings: those that the configuration may have are the keyword-only arguments of this
-                method and, as it has ``**settings``, of the constructor.
+            settings: from the configuration. Allowed are the keyword-only arguments of this method
+                and, because it has ``**settings``, those of the constructor.
         """
         make: Any = cls
         made: Curriculum = make(run.task.space, **settings)
         return made
 
     def propose(self, student: Student, count: int, rng: Streams) -> Levels | Batch:
-        """Returns levels [n] for the student to train on next, with notes where it needs any.
+        """Returns levels [n] for the student to train on next, with or without notes.
 
         Args:
-            student: as it is.
-            count: number n of levels; any number, and not always the same.
+            student: in its current state.
+            count: number n of levels, which may differ from call to call.
             rng: named random streams of this proposal, such as ``rng.generator("levels")``.
         """
         raise TypeError(f"{type(self).__name__} must define propose(student, count, rng)")
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Learns from the outcome of a batch or of a part of one.
+        """Learns from the outcome of a batch, or of a part of it.
 
         Args:
-            student: after it has trained on the levels, or while it does.
-            batch: as it was proposed, or a part of it, m levels in the order of the proposal.
+            student: after it trained on the levels, or while it does.
+            batch: the proposed batch or a part of it, m levels in the order of the proposal.
             outcome: a tensordict [m]; see :func:`outcome_of`.
         """
 
     def log(self) -> dict[str, Any]:
         """Returns what happened since the last call, ready for JSON; empty if nothing did.
 
-        Its entry ``levels`` has levels [m] by their captions. It is called after every cycle.
+        The entry ``levels`` may hold levels [m] by caption. Called after every cycle.
         """
         return {}
 
     def learnt(self) -> dict[str, Any]:
-        """Returns the part of the state that runs on other students can begin with, or nothing."""
+        """Returns the part of the state that other runs can start from; empty for none."""
         return {}
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that a resumed run needs, in nested dicts of tensors, numbers and strings."""
+        """Returns all that a resumed run needs, as nested dicts of tensors, numbers and strings."""
         kind: Any = type(self)
         _warn_of_nothing(kind)
         return {name.strip("_"): saved(getattr(self, name)) for name in self.state}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned.
+        """Restores what :meth:`state_dict` returned.
 
         Raises:
-            ArgumentError: if that was the state of another class.
+            ArgumentError: if it is the state of another class.
         """
         own = self.state_dict().keys()
         if state.keys() != own:
@@ -199,35 +202,35 @@ class Curriculum:
             setattr(self, name, restored(state[name.strip("_")], getattr(self, name)))
 
     def close(self) -> None:
-        """Releases what is held outside of this process."""
+        """Releases resources outside of this process."""
 
 
 class LearnedCurriculum(Curriculum):
-    """A curriculum that trains something before a cycle, such as a Proposer or one of its parts.
+    """The base class of curricula that train something of their own, such as a Proposer.
 
     Attributes:
-        trains_replicas: whether it trains replicas of the student, which other processes can do.
+        trains_replicas: whether it trains replicas of the student, possibly in other processes.
     """
 
     trains_replicas: bool = False
 
     def improve(self, student: Student, rng: Streams) -> dict[str, Any]:
-        """Prepares for the next cycle, and returns metrics of it as :meth:`Curriculum.log` does.
+        """Trains before a cycle, and returns metrics as :meth:`Curriculum.log` does.
 
-        If it raises, :meth:`Curriculum.load_state_dict` and another call may follow.
+        After an exception the state may be restored and this method called again.
 
         Args:
-            student: as it is before the cycle.
+            student: in its state before the cycle.
             rng: named random streams of the cycle.
         """
         return {}
 
 
 def proposed(curriculum: Curriculum, student: Student, count: int, rng: Streams) -> Batch:
-    """Lets a curriculum propose, and returns its levels as a batch, with or without notes.
+    """Lets a curriculum propose, and returns its levels as a batch.
 
     Raises:
-        ArgumentError: if they are not ``count`` levels.
+        ArgumentError: if it does not propose ``count`` levels.
     """
     levels = curriculum.propose(student, count, rng)
     batch = levels if isinstance(levels, Batch) else Batch(levels)
@@ -241,13 +244,13 @@ def proposed(curriculum: Curriculum, student: Student, count: int, rng: Streams)
 
 @functools.cache
 def _warn_of_nothing(kind: type[Curriculum]) -> None:
-    """Warns, once, of a class that observes and does not say what of that is to be saved."""
+    """Warns once about a class that observes but does not name the state to save."""
     said = kind.state_dict is not Curriculum.state_dict or any(
         "state" in vars(parent) for parent in kind.__mro__ if parent is not Curriculum
     )
     if kind.observe is not Curriculum.observe and not said:
         warnings.warn(
-            f"{kind.__name__} observes, but a resumed run begins anew: name the attributes to be "
-            "saved, state = (...), or () for none",
+            f"{kind.__name__} observes, but saves nothing for a resumed run: list what to save in "
+            "state = (...), or set state = ()",
             stacklevel=3,
         )

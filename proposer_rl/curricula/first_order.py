@@ -1,4 +1,4 @@
-"""Curricula in closed form: train on bins that raise the target's performance to first order."""
+"""First-order gain: trains on the bins that raise performance on the target fastest."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from proposer_rl.task import Distribution, Space
 
 
 class FirstOrderCurriculum(BinCurriculum):
-    """Draws bins by the mean alignment of fresh levels of each, which nobody plays.
+    """Draws bins by the mean alignment of fresh levels in each, which nobody plays.
 
     The alignment of a level is the slope of its return along the direction of the parameters that
     raises the target's performance fastest (:mod:`proposer_rl.meta.first_order`). Returns are
@@ -88,7 +88,7 @@ class FirstOrderCurriculum(BinCurriculum):
         return (score / (self._temperature * largest)).softmax(-1)
 
     def log(self) -> dict[str, Any]:
-        """Returns also the target's performance when last scored, and the scores' errors."""
+        """Adds the last performance on the target and the standard errors of the scores."""
         record = super().log()
         if record:
             record["target_performance"] = float(self.scores["target"])

@@ -1,4 +1,4 @@
-"""ALP-GMM: levels from where a mixture of Gaussians has seen absolute learning progress."""
+"""ALP-GMM: draws levels where a mixture of Gaussians has seen absolute learning progress."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from annotated_types import Interval
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.bins import along_axes, counts_of_bins
-from proposer_rl.curricula.contract import Batch, Curriculum
+from proposer_rl.curricula.bins import CountingCurriculum
+from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.points import Points, nearest
 from proposer_rl.curricula.student import Student
 from proposer_rl.extras import install_command
@@ -24,8 +24,8 @@ LEAST_STORED = 6  # earlier episodes, below which progress is 0
 TwoOrMore = Annotated[int, Interval(ge=2, le=1_000_000)]
 
 
-class MixtureCurriculum(Curriculum):
-    """Draws levels as points of a box, and rounds them to the space's bins.
+class MixtureCurriculum(CountingCurriculum):
+    """Draws levels as points of a box, from Gaussians fitted to recent learning progress.
 
     A point of the box [-1, 1]^D that the space's coordinates span is rounded to a bin, whose
     coordinates x are the task. The progress of an episode on x with return r is |r - r'|, with r'
@@ -84,7 +84,7 @@ class MixtureCurriculum(Curriculum):
                 f"components={components}: must be at most refit={refit}, and that at most "
                 f"warmup={warmup}: a mixture is fitted to that many episodes"
             )
-        self.space = space
+        super().__init__(space)
         self.needs = ("performance",) if source == "exact" else ()
         self._source, self._components, self._refit = source, components, refit
         self._warmup, self._exploration = warmup, exploration
@@ -92,11 +92,10 @@ class MixtureCurriculum(Curriculum):
         self._history: dict[str, Tensor] = {}
         self._mixture: list[Tensor] = []  # see fit_mixture
         self._fitted = 0  # episodes at the last fit
-        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._drawn = torch.zeros(2, dtype=torch.int64)  # from mixtures, and clipped of these
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Draws points, and returns levels [n] of the bins nearest to them."""
+        """Draws points, and returns the levels [n] of the nearest bins."""
         self._fit(rng)
         points = self._draw(count, rng.generator("choices"))
         levels, bins = self._points.levels(points, rng)
@@ -108,8 +107,8 @@ class MixtureCurriculum(Curriculum):
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Adds tasks, returns and progress to the history."""
+        super().observe(student, batch, outcome)
         notes = batch.notes
-        self._counts += counts_of_bins(notes["bins"], self.space)
         returns = outcome["return"] if self._source == "episodes" else notes["returns"]
         points, returns = notes["points"], returns.double().cpu()
         tasks = self._points.tasks(points, notes["bins"])
@@ -128,10 +127,9 @@ class MixtureCurriculum(Curriculum):
             return {}
         drawn, clipped = self._drawn.tolist()
         self._drawn = torch.zeros_like(self._drawn)
-        counts, self._counts = self._counts, torch.zeros_like(self._counts)
         means = self._mixture[0].tolist() if self._mixture else []
         return {
-            "histogram": along_axes(counts, self.space),
+            "histogram": self.histogram(),
             "progress": float(self._history["progress"][-self._refit :].mean()),
             "components": len(means),
             "means": means,
@@ -139,7 +137,7 @@ class MixtureCurriculum(Curriculum):
         }
 
     def _fit(self, rng: Streams) -> None:
-        """Fits a new mixture if it is time."""
+        """Fits a new mixture if one is due."""
         episodes = len(self._history["returns"]) if self._history else 0
         due = episodes // self._refit > self._fitted // self._refit
         if episodes < self._warmup or not due:
@@ -166,7 +164,7 @@ class MixtureCurriculum(Curriculum):
 
 
 def fit_mixture(points: Tensor, most: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Fits mixtures of 2 to ``most`` Gaussians, and returns the one with the least AIC.
+    """Fits mixtures of 2 to ``most`` Gaussians, and returns the one with the lowest AIC.
 
     Full covariances, expectation maximisation from one start by k-means
     (Portelas et al. 2019, arXiv 1910.07224, algorithm 1).
@@ -227,7 +225,7 @@ def draw_points(
 def absolute_progress(
     tasks: Tensor, returns: Tensor, new_tasks: Tensor, new_returns: Tensor
 ) -> Tensor:
-    """Returns |r - r'| of new episodes, with r' the return on the nearest of earlier tasks.
+    """Returns |r - r'| of new episodes, where r' is the return on the nearest earlier task.
 
     Portelas et al. 2019 (arXiv 1910.07224), equation of the absolute learning progress. As in their
     code, it is 0 as long as no more than five are stored.

@@ -1,12 +1,13 @@
-"""Curricula of items that come back, such as prompts, by how many of G answers were right.
+"""Curricula of items such as prompts, which come back, by how many of G answers were right.
 
-Each draws from the items of a data set, or from the bins of another space, and keeps a few numbers
-of each. m of the G answers to an item were right, whose chance of one is p. An outcome's success is
-m / G and its ``episodes`` are G; graded answers give a sum m of their grades. Groups teach only
-where they are mixed, which has the probability 1 - p^G - (1 - p)^G.
+Each draws items of a data set, or bins of another space, and keeps a few numbers about each item.
+An item has the probability p of a right answer; m of its G answers were right. The success of its
+outcome is m / G, and its ``episodes`` are G; where answers are graded, m is the sum of the grades.
+A group of answers teaches only if they are not all alike, which has the probability
+1 - p^G - (1 - p)^G.
 
-None of them has a floor of exploration: what is believed to be out of reach is hardly drawn again.
-See :class:`~proposer_rl.curricula.AdaptiveMixture` for one that is.
+These curricula have no floor of exploration: an item that seems out of reach is hardly drawn again.
+:class:`~proposer_rl.curricula.AdaptiveMixture` has such a floor.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ PRIOR = math.pi**2 / 16 - 0.5  # variance of the arc length of a probability tha
 
 
 class ItemCurriculum(Curriculum):
-    """Draws items by numbers of each, which it moves by what answers have shown.
+    """Draws items by numbers that it keeps about each and updates by the answers.
 
     A subclass says which numbers these are at first, what is drawn, and what is learnt.
 
@@ -54,11 +55,11 @@ class ItemCurriculum(Curriculum):
 
     @abstractmethod
     def first_numbers(self) -> dict[str, Tensor]:
-        """Returns the numbers of items before anything is known, by name."""
+        """Returns the numbers about items before any answer, by name."""
 
     @abstractmethod
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draws places of items, int64 [n].
+        """Draws the places of items, int64 [n].
 
         Args:
             count: number n of items, perhaps more than there are.
@@ -67,18 +68,18 @@ class ItemCurriculum(Curriculum):
 
     @abstractmethod
     def learn(self, seen: dict[str, Tensor]) -> None:
-        """Moves the numbers, in place, by a batch.
+        """Updates the numbers, in place, by the answers to a batch.
 
         Args:
             seen: ``item``, places int64 [m], ``success`` and ``count`` of answers, float64 [m].
         """
 
     def expected(self) -> Tensor | None:
-        """Returns the expected success on each item, float64 [N], if there is such a belief."""
+        """Returns the expected success on each item, float64 [N]; None if there is no estimate."""
         return None
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Returns items [n], each once where there are enough."""
+        """Returns items [n], each at most once if there are enough."""
         self.numbers = self.numbers or self.first_numbers()
         came, self._came = self._came, []
         for seen in came:
@@ -93,7 +94,7 @@ class ItemCurriculum(Curriculum):
         return Batch(levels, TensorDict(notes, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Keeps what came of items, which the next proposal learns from."""
+        """Keeps the outcome of items until the next proposal, which learns from it."""
         success = outcome["success"].double().cpu()
         counts = torch.ones_like(success)
         if "rollout" not in outcome.keys():  # whose success is that of its first episode
@@ -101,12 +102,12 @@ class ItemCurriculum(Curriculum):
         self._came.append({**batch.notes.to_dict(), "success": success, "count": counts})
 
     def log(self) -> dict[str, Any]:
-        """Returns how right the belief was, as of the adaptive mixture, if there is one."""
+        """Returns how accurate the expectations were, if there are any."""
         return self._seen.log()
 
 
 class BetaSampling(ItemCurriculum):
-    """MoPPS: the items nearest to a success by a draw from a Beta distribution of each.
+    """MoPPS: draws each item's success from a Beta distribution; takes those nearest to an aim.
 
     Qu et al. 2025 (arXiv 2507.04632): of an item that was drawn,
 
@@ -139,7 +140,7 @@ class BetaSampling(ItemCurriculum):
         return nearest(a / (a + b) - self._aim, count, generator)
 
     def learn(self, seen: dict[str, Tensor]) -> None:
-        """Moves the Beta distributions of the items that were seen."""
+        """Updates the Beta distributions of the items that were answered."""
         items, answers, right = per_item(seen)
         for name, number in (("a", right), ("b", answers - right)):
             own = self.numbers[name]
@@ -151,7 +152,7 @@ class BetaSampling(ItemCurriculum):
 
 
 class AdaptiveDifficulty(ItemCurriculum):
-    """AdaRFT: the items whose difficulty is nearest to one that follows the reward.
+    """AdaRFT: draws the items nearest to a difficulty that follows the mean success.
 
     Shi et al. 2025 (arXiv 2504.05520), with difficulties from 0 to 1, 1 less a pass rate: with r
     the mean success of a batch,
@@ -196,7 +197,7 @@ class AdaptiveDifficulty(ItemCurriculum):
         return nearest(self._difficulty - self.numbers["difficulty"], count, generator)
 
     def learn(self, seen: dict[str, Tensor]) -> None:
-        """Moves T."""
+        """Moves T by the mean success of the batch."""
         reward = (seen["success"] * seen["count"]).sum() / seen["count"].sum()
         moved = self._step * (self._sensitivity * (reward - self._aim)).tanh()
         low, high = self._difficulty.min(), self._difficulty.max()
@@ -208,7 +209,7 @@ class AdaptiveDifficulty(ItemCurriculum):
 
 
 class CategoryBandit(ItemCurriculum):
-    """SEC: categories in shares by a value of each, and uniform items of these.
+    """SEC: draws categories by a learnt value of each, and items of a category uniformly.
 
     Chen et al. 2025 (arXiv 2505.14970): shares are softmax(Q / temperature), and with r the mean
     size of an advantage in the answers of a category, TD(0) is
@@ -256,7 +257,7 @@ class CategoryBandit(ItemCurriculum):
         return places
 
     def learn(self, seen: dict[str, Tensor]) -> None:
-        """Moves the values of the categories that were seen."""
+        """Updates the values of the categories that were drawn."""
         category, p = self._categories[seen["item"]], seen["success"]
         zero = torch.zeros_like(self.numbers["value"])
         number = zero.index_add(0, category, torch.ones_like(p))
@@ -272,12 +273,12 @@ class CategoryBandit(ItemCurriculum):
         self.numbers["value"].lerp_(reward, self._rate * (number > 0).double())
 
     def log(self) -> dict[str, Any]:
-        """Returns the values of categories."""
+        """Returns the values of the categories."""
         return {name: each.tolist() for name, each in self.numbers.items()}
 
 
 class ArcLengthFilter(ItemCurriculum):
-    """Filters each item's arc length, psi = arcsin(sqrt(p)), and draws those near to a wanted one.
+    """Tracks each item's arc length, psi = arcsin(sqrt(p)), and draws those near a wanted one.
 
     After ARCUS (arXiv 2609.38018). Whatever p is, the arc length z of m of G answers has the
     variance 1 / (4 G + 2), and 1 / (2 G) where all or none were right, see :func:`arc_length`. A
@@ -324,7 +325,7 @@ class ArcLengthFilter(ItemCurriculum):
         }
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draws items without replacement, by their scores."""
+        """Draws items without replacement, in proportion to their scores."""
         own = self.numbers
         wanted = wanted_arc(float(own["answers"]), self._slack)
         spread = own["variance"] + self._width**2
@@ -334,7 +335,7 @@ class ArcLengthFilter(ItemCurriculum):
         return nearest(waits.log() - score, count, generator, smallest=True)
 
     def learn(self, seen: dict[str, Tensor]) -> None:
-        """Lets a batch pass, and moves the arc lengths of the items that were seen."""
+        """Moves all arc lengths by the drift, and those of answered items by their answers."""
         own = self.numbers
         items, answers, right = per_item(seen)
         own["psi"].add_(own["drift"]).clamp_(0, math.pi / 2)
@@ -358,7 +359,7 @@ class ArcLengthFilter(ItemCurriculum):
 
 
 def per_item(seen: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns the items that were seen, each once, int64 [m], and their answers and right ones."""
+    """Sums a batch by item: the items, int64 [m], their answers and their right answers."""
     items, row = seen["item"].unique(return_inverse=True)
     none = torch.zeros(len(items), dtype=torch.float64)
     answers = none.index_add(0, row, seen["count"])
@@ -368,7 +369,7 @@ def per_item(seen: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
 def nearest(
     distances: Tensor, count: int, generator: torch.Generator, smallest: bool = False
 ) -> Tensor:
-    """Returns places of the least distances, int64 [n], in a random order.
+    """Returns the places of the smallest distances in random order, int64 [n].
 
     Equal ones are taken at random; each comes once, or as often as all do.
 
@@ -387,7 +388,7 @@ def nearest(
 
 
 def arc_length(right: Tensor, answers: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the arc length that m right ones of G answers show, and its variance.
+    """Estimates an arc length and its variance from m right answers out of G.
 
     Args:
         right: m, float64 [n].
@@ -401,7 +402,7 @@ def arc_length(right: Tensor, answers: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def wanted_arc(answers: float, slack: float) -> float:
-    """Returns the arc length of the lowest p where groups are mixed nearly as often as at 1/2."""
+    """Returns the arc length of the lowest p whose groups are mixed nearly as often as at 1/2."""
     p = torch.linspace(0, 0.5, 1001, dtype=torch.float64)
     often = mixed(p, answers)
     enough = often >= (1 - slack) * often[-1] - 1e-12

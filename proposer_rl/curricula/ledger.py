@@ -1,4 +1,4 @@
-"""One record of which levels are where: by rising id, each waiting, out, returned or over."""
+"""Keeps track of proposed levels by id: waiting, handed out, returned, or over."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
-from proposer_rl.curricula.batches import device_of, moved, of_kind, packed
+from proposer_rl.curricula.batches import packed, unpacked
 from proposer_rl.curricula.contract import Batch
 from proposer_rl.settings import ArgumentError
 from proposer_rl.task import Levels
@@ -20,17 +20,17 @@ from proposer_rl.task import Levels
 Ids = NDArray[np.int64]
 
 WAITING, OUT, RETURNED, OVER = range(4)
-"""Proposed; handed out; with a result that has not been observed; observed or dropped."""
+"""Proposed; handed out; with a result that is not yet observed; observed or given up."""
 STATES = ("has not been handed out", "", "has been told before", "is over")
 
 
 class Block:
-    """Holds one proposal of a curriculum: levels [n] whose ids follow one another.
+    """One proposal of a curriculum: levels [n] with consecutive ids.
 
     Attributes:
         start, end: the first id, and the one after the last.
-        batch: as it was proposed; see :meth:`Ledger.take` for when it is cut down.
-        levels: those that were proposed, [n].
+        batch: the proposal; :meth:`Ledger.take` may cut it down to some of its levels.
+        levels: all proposed levels, [n].
         state: of each level, uint8 [n].
         results: by name, [n]; NaN or None where there is none yet.
     """
@@ -43,16 +43,16 @@ class Block:
             name: np.full(len(batch), None if kind is object else np.nan, kind)
             for name, kind in kinds.items()
         }
-        self.places: Ids | None = None  # of the levels that the batch is cut down to
+        self.places: Ids | None = None  # of the levels to which the batch was cut down
 
 
 class Found(NamedTuple):
-    """Some ids of one block.
+    """Ids that :meth:`Ledger.find` found in one block.
 
     Attributes:
-        block: theirs.
-        which: of the ids that were looked for, int64 [m].
-        place: where these stand in the block, int64 [m].
+        block: that holds them.
+        which: their positions among the ids that were asked for, int64 [m].
+        place: their positions in the block, int64 [m].
     """
 
     block: Block
@@ -61,18 +61,18 @@ class Found(NamedTuple):
 
 
 class Ledger:
-    """Levels that a student has not done with, in the order in which they were proposed.
+    """Keeps the levels whose results a curriculum has yet to observe, in the order of proposal.
 
-    Ids count the levels from 0 on. Results come back in any order, in parts or never, and are
+    Ids count levels from 0. Results may come back in any order, in parts or never; they are
     observed in the order of the ids.
 
     Args:
-        kinds: types of the results that are noted of a level, by name: ``float`` or ``object``.
+        kinds: types of the results of a level, by name: ``float`` or ``object``.
 
     Attributes:
         next: the id of the next level.
-        blocks: those in which something is not over.
-        returned: whether there is a result that :meth:`take` has not given.
+        blocks: blocks with levels that are not over.
+        returned: whether there are results that :meth:`take` has not yielded yet.
     """
 
     def __init__(self, kinds: Mapping[str, type]) -> None:
@@ -82,24 +82,24 @@ class Ledger:
 
     @property
     def out(self) -> int:
-        """The number of ids that are out."""
+        """The number of levels that are handed out."""
         return sum(int((block.state == OUT).sum()) for block in self.blocks)
 
     def add(self, batch: Batch) -> Block:
-        """Numbers the levels of a batch, which wait from now on."""
+        """Gives ids to the levels of a batch; they wait until they are handed out."""
         block = Block(self.next, batch, self._kinds)
         self.blocks.append(block)
         self.next = block.end
         return block
 
     def block_of(self, id: int) -> Block | None:
-        """Returns the block of an id; None where all of it is over or there never was one."""
+        """Returns the block of an id; None if the id is unknown or its whole block is over."""
         number = bisect_right(self.blocks, id, key=attrgetter("start")) - 1
         block = self.blocks[number] if number >= 0 else None
         return block if block is not None and id < block.end else None
 
     def states(self, ids: Ids) -> NDArray[np.uint8]:
-        """Returns the states of ids [n]; of those that there never were, that they wait."""
+        """Returns the states of ids [n]; an unknown id counts as waiting."""
         states = np.where((ids >= 0) & (ids < self.next), OVER, WAITING).astype(np.uint8)
         for block in self.blocks:
             inside = (ids >= block.start) & (ids < block.end)
@@ -107,10 +107,10 @@ class Ledger:
         return states
 
     def find(self, ids: Ids) -> list[Found]:
-        """Returns where ids [n] are, all of which must be out.
+        """Locates ids [n], all of which must be handed out.
 
         Raises:
-            ArgumentError: for one that is not out, or stands there twice.
+            ArgumentError: for an id that is not handed out, or is given twice.
         """
         number = np.searchsorted([block.start for block in self.blocks], ids, "right")
         parts = []
@@ -133,14 +133,14 @@ class Ledger:
         return parts
 
     def hand_out(self, id: int) -> Levels:
-        """Returns the level that waits under an id, [], which is out from now on."""
+        """Hands out the waiting level, [], with this id."""
         block = self.block_of(id)
         assert block is not None  # which are kept until they are over
         block.state[id - block.start] = OUT
         return block.levels[id - block.start]
 
     def tell(self, parts: list[Found], results: Mapping[str, NDArray[Any]]) -> None:
-        """Notes results [n] of ids [n] that were found."""
+        """Records results [n] for ids [n] that were found."""
         for block, which, place in parts:
             for name, result in results.items():
                 block.results[name][place] = result[which]
@@ -148,10 +148,10 @@ class Ledger:
         self.returned = True
 
     def tell_one(self, id: int, results: Mapping[str, Any]) -> None:
-        """Notes the results of one level.
+        """Records the results of one level.
 
         Raises:
-            ArgumentError: if it is not out.
+            ArgumentError: if the level is not handed out.
         """
         block = self.block_of(id)
         place = 0 if block is None else id - block.start
@@ -164,32 +164,32 @@ class Ledger:
         self.returned = True
 
     def drop(self, parts: list[Found]) -> None:
-        """Notes that nothing more comes of ids that were found."""
+        """Gives up the ids that were found: no result is expected any more."""
         for block, _, place in parts:
             block.state[place] = OVER
 
     def is_out(self, id: int) -> bool:
-        """Returns whether a level is out."""
+        """Returns whether a level is handed out."""
         block = self.block_of(id)
         return block is not None and bool(block.state[id - block.start] == OUT)
 
     def drop_one(self, id: int) -> None:
-        """Notes that nothing comes of a level, if nothing has."""
+        """Gives up one level, unless its result has come back."""
         block = self.block_of(id)
         if block is not None and block.state[id - block.start] <= OUT:
             block.state[id - block.start] = OVER
 
     def drop_all(self) -> None:
-        """Notes that nothing more comes of any that is out."""
+        """Gives up all levels that are handed out."""
         for block in self.blocks:
             block.state[block.state == OUT] = OVER
 
     def take(self, settled: bool = False) -> Iterator[tuple[Batch, dict[str, NDArray[Any]]]]:
-        """Yields the results since the last time, block by block, and forgets what is over.
+        """Yields the results since the last call, block by block, and forgets the levels.
 
         Args:
-            settled: whether a block is taken only when none of its levels waits. Its batch is then
-                cut down to those levels that were not dropped, as if they alone had been proposed.
+            settled: whether to take a block only when none of its levels waits. Its batch is then
+                cut down to the levels that were not given up, as if only these were proposed.
 
         Yields:
             A part of a batch [m], and its results [m] by name.
@@ -222,7 +222,7 @@ class Ledger:
         raise ArgumentError(f"ids={id}: {reason}")
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all of it, with the levels that are not over."""
+        """Returns the whole ledger, with the levels that are not over."""
         return {
             "next": self.next,
             "returned": self.returned,
@@ -242,16 +242,16 @@ class Ledger:
     def load_state_dict(
         self, state: Mapping[str, Any], like: Levels, device: torch.device | None = None
     ) -> None:
-        """Puts back what :meth:`state_dict` returned.
+        """Restores what :meth:`state_dict` returned.
 
         Args:
-            state: whose tensors are on the CPU.
-            like: a level of the kind, where levels are to be.
-            device: where results that are tensordicts go.
+            state: with tensors on the CPU.
+            like: a level of the same kind, on the device for the levels.
+            device: for results that are tensordicts.
         """
         self.blocks = []
         for kept in state["blocks"]:
-            levels = moved(of_kind(like, kept["levels"]), device_of(like))
+            levels = unpacked(kept["levels"], like)
             places = kept["places"]
             some = levels if places is None else levels[places]
             notes: Any = TensorDict.from_dict(dict(kept["notes"]), batch_size=some.shape[:1])

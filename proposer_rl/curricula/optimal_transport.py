@@ -1,4 +1,4 @@
-"""CurrOT on the bins: a distribution that moves to the target through what is mastered."""
+"""CurrOT on the bins: moves the distribution of levels to the target through mastered bins."""
 
 from __future__ import annotations
 
@@ -82,20 +82,23 @@ class TransportCurriculum(BinCurriculum):
         self._delta, self._epsilon = delta, epsilon
         self._probes = Probes(space, probes, measure)
         self._target = (target_shares.double() / target_shares.double().sum()).numpy()
-        self._costs = squared_distances(space)
+        places = space.coordinates.double()
+        apart = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
+        self._costs = apart.square().numpy()  # [N, N]
 
     @classmethod
     def create(cls, run: Components, **settings: Any) -> TransportCurriculum:
-        """Makes it for a run's space and the shares of its bins in the target."""
+        """Makes it for a run's space and the target's shares of its bins."""
         return cls(run.task.space, run.task.target_shares, **settings)
 
     def score(self, student: Student, count: int, rng: Streams) -> None:
         """Moves the distribution by the student's performance on the probes."""
         performance = self._probes.performance(student, rng)
-        allowed = mastered(performance, self._delta)
+        # Where no bin is mastered, those of the best performance are allowed.
+        allowed = performance >= performance.max().clamp(max=self._delta)
         even = torch.full(performance.shape, 1 / len(performance), dtype=torch.float64)
-        now, costs = self.scores.get("share", even).numpy(), self._costs.numpy()
-        moved, left = step_towards(self._target, now, costs, allowed.numpy(), self._epsilon)
+        now = self.scores.get("share", even).numpy()
+        moved, left = step_towards(self._target, now, self._costs, allowed.numpy(), self._epsilon)
         share = torch.from_numpy(moved)
         share = share.where(share > NOTHING, 0.0)
         self.scores = {
@@ -113,7 +116,7 @@ class TransportCurriculum(BinCurriculum):
         return (1 - part) * share + part / len(share)
 
     def log(self) -> dict[str, Any]:
-        """Returns also how many bins are allowed, and the distance W2 to the target."""
+        """Adds the number of allowed bins and the distance W2 to the target."""
         record = super().log()
         if record:
             record["allowed_bins"] = int(self.scores["allowed"].sum())
@@ -121,26 +124,10 @@ class TransportCurriculum(BinCurriculum):
         return record
 
 
-def squared_distances(space: Space) -> Tensor:
-    """Returns the squared distances between the bins of a space: float64 [N, N]."""
-    places = space.coordinates.double()
-    return torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist").square()
-
-
-def mastered(performance: Tensor, delta: float) -> Tensor:
-    """Returns which bins are mastered, bool [*B, N]: where none is, those of the best performance.
-
-    Args:
-        performance: in each bin, float [*B, N].
-        delta: least performance of a mastered bin.
-    """
-    return performance >= performance.amax(-1, keepdim=True).clamp(max=delta)
-
-
 def step_towards(
     target: Floats, now: Floats, costs: Floats, allowed: Mask, reach: float
 ) -> tuple[Floats, float]:
-    """Returns the distribution on allowed bins, near the present one, that is nearest the target.
+    """Returns the distribution nearest to the target that is on allowed bins and within reach.
 
     The minimum of W2(p, target) over distributions p with W2(p, now) <= reach and p = 0 where not
     allowed (Klink et al. 2022, "Curriculum Reinforcement Learning via Constrained Optimal

@@ -1,4 +1,4 @@
-"""Predicts what a student would reach on any level, by regression on the levels they trained on.
+"""Predicts what a student would reach on any level, from the levels that it trained on.
 
 Every update ends with labelled data, levels and what came of them, that cost nothing more. Of the
 last batches' rows phi_i with outcomes y_i, where what is ``age`` batches old has the weight
@@ -104,7 +104,7 @@ def logistic_ridge(
 
 
 def linear_ridge(features: Tensor, values: Tensor, weights: Tensor, ridge: float) -> Tensor:
-    """Fits a linear regression to values float64 [m], with the rest as in logistic_ridge.
+    """Fits a linear regression to values float64 [m]; the rest is as in :func:`logistic_ridge`.
 
     Returns:
         Coefficients, float64 [F], all of which are penalised.
@@ -115,7 +115,7 @@ def linear_ridge(features: Tensor, values: Tensor, weights: Tensor, ridge: float
 
 
 class OutcomeModel:
-    """Predicts what a student would reach on levels, from the outcomes of the last batches.
+    """Predicts what a student would reach on levels, from the outcomes of recent batches.
 
     Args:
         labels: what the probability is of: ``"success"``, as outcomes have it; or
@@ -140,7 +140,7 @@ class OutcomeModel:
         self._fitted: _Fitted | None = None
 
     def add(self, features: Tensor, outcome: Mapping[str, Tensor], *, as_old: bool = False) -> None:
-        """Adds a batch to the data.
+        """Adds a batch to the training data.
 
         Args:
             features: float64 [m, F]; a constant one is a further intercept.
@@ -178,18 +178,18 @@ class OutcomeModel:
         )
 
     def labels(self, outcome: Mapping[str, Tensor]) -> Tensor:
-        """Returns the labels in [0, 1] that the model takes from an outcome: float64 [m]."""
+        """Converts an outcome to the labels in [0, 1] that the model fits: float64 [m]."""
         if self._labels == "success":
             return outcome["success"]
         worst = torch.minimum(self._worst, outcome["return"].amin())
         return (outcome["return"] > worst + EQUAL * (1 + worst.abs())).double()
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the data, and the worst return."""
+        """Returns the training data and the lowest return so far."""
         return {"batches": [dict(batch) for batch in self._batches], "worst": self._worst}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned."""
         self._batches = [dict(batch) for batch in state["batches"]]
         self._worst, self._fitted = state["worst"], None
 
@@ -220,7 +220,7 @@ class OutcomeModel:
 
 
 class Modelled(Combinator):
-    """A curriculum that asks a model of outcomes instead of the student how well it does.
+    """Runs a curriculum on predictions of the student's performance instead of evaluations.
 
     Whatever the curriculum asks as ``performance`` or ``exact_performance``, by a scoring pass or a
     filter, an :class:`~proposer_rl.curricula.outcome_model.OutcomeModel` answers, which is fitted
@@ -257,7 +257,7 @@ class Modelled(Combinator):
 
     @classmethod
     def around(cls, curriculum: Curriculum, run: Components, **settings: Any) -> Modelled:
-        """Makes it for the features of a run's levels.
+        """Makes it for a run whose task has features of levels.
 
         Raises:
             ArgumentError: if they have none.
@@ -266,7 +266,7 @@ class Modelled(Combinator):
         return cls(curriculum, run.task.features, **settings)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Returns what the curriculum proposes, with a student whose performance is predicted."""
+        """Returns what the curriculum proposes to a student whose performance is predicted."""
         self._has_observed = False
         batch = proposed(self.parts[0], _answering(student, self._predict), count, rng)
         phi = self._phi(batch.levels)
@@ -275,7 +275,7 @@ class Modelled(Combinator):
         return Batch(batch.levels, TensorDict(notes, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Adds the outcome to the model's data, and passes it on to the curriculum.
+        """Adds the outcome to the training data of the model, and passes it on to the curriculum.
 
         All that is observed between two proposals counts as one batch.
         """
@@ -287,11 +287,11 @@ class Modelled(Combinator):
         self._has_observed = True
 
     def improve(self, student: Student, rng: Streams) -> dict[str, Any]:
-        """Improves the curriculum, with a student whose performance the model predicts."""
+        """Improves the curriculum with a student whose performance is predicted."""
         return super().improve(_answering(student, self._predict), rng)
 
     def log(self) -> dict[str, Any]:
-        """Returns also how right the model was, as :func:`calibration`."""
+        """Adds how accurate the predictions were; see :func:`calibration`."""
         return super().log() | self._seen.log()
 
     def _predict(self, levels: Levels) -> TensorDict:
@@ -302,7 +302,7 @@ class Modelled(Combinator):
 
 
 class Predictions:
-    """Keeps predictions and outcomes of levels since the last log."""
+    """Keeps predictions and outcomes of levels until the next log."""
 
     def __init__(self) -> None:
         self._seen: list[list[Tensor]] = []
@@ -312,7 +312,7 @@ class Predictions:
         self._seen = [*self._seen[1 - LOGGED :], [predicted, label]]
 
     def log(self) -> dict[str, Any]:
-        """Returns their :func:`calibration`, or nothing, and begins anew."""
+        """Returns the :func:`calibration` of what was added, if anything was, and starts anew."""
         seen, self._seen = self._seen, []
         return calibration(*(torch.cat(one) for one in zip(*seen, strict=True))) if seen else {}
 
@@ -321,12 +321,12 @@ class Predictions:
         return {"seen": saved(self._seen)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned."""
         self._seen = saved(state["seen"])
 
 
 def calibration(predicted: Tensor, label: Tensor) -> dict[str, Any]:
-    """Returns how right a model was about levels before it saw what came of them, for JSON.
+    """Compares probabilities that were predicted with what happened, ready for JSON.
 
     ``brier``, the mean squared error of the predicted probabilities, and ``brier_constant``, that
     of one number for all; ``reliability``, for each tenth of the probabilities how many were
@@ -354,7 +354,7 @@ def calibration(predicted: Tensor, label: Tensor) -> dict[str, Any]:
 
 
 class _Fitted(NamedTuple):
-    """The coefficients of fitted regressions, and the mean and deviation of returns."""
+    """Coefficients of the fitted regressions, and the mean and deviation of returns."""
 
     beta: Tensor
     covariance: Tensor
@@ -364,7 +364,7 @@ class _Fitted(NamedTuple):
 
 
 def _answering(student: Student, predict: Callable[[Levels], TensorDict]) -> Student:
-    """Returns a student whose performance a model predicts, and that does all else itself."""
+    """Returns a student whose performance is predicted, and who does everything else itself."""
     own = [name for name in ABILITIES if name not in ANSWERED and student.lacks(name) is None]
     answering = Student(
         gamma=student.gamma,

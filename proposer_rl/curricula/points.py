@@ -1,4 +1,4 @@
-"""Levels at points of a box, for curricula that draw from continuous distributions."""
+"""Turns points of a box into levels, for curricula that draw from continuous distributions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Place = Annotated[float, Interval(ge=-1, le=1)]
 
 
 class Points:
-    """The levels of a space at points of the box [-1, 1]^D that its coordinates span.
+    """Turns points of the box [-1, 1]^D, which the coordinates of a space span, into levels.
 
     Args:
         space: that has the bins.
@@ -56,7 +56,7 @@ class Points:
 
     @property
     def free(self) -> Tensor:
-        """Returns the coordinates along which levels differ, int64 [F]."""
+        """Returns the coordinates along which levels can differ, int64 [F]."""
         places = self._space.coordinates
         differ = places.amax(0) > places.amin(0)
         return (differ | (not self._rounded)).nonzero().flatten()
@@ -83,7 +83,7 @@ class Points:
         return self._space.coordinates.double()[bins] if self._rounded else points
 
     def at(self, start: Mapping[str, float] | None) -> Tensor:
-        """Returns the point with some places by their axes' names, else 0: float64 [D].
+        """Returns the point with the given places along named axes, and 0 elsewhere: float64 [D].
 
         Raises:
             ArgumentError: for a name that is no axis's.
@@ -98,7 +98,7 @@ class Points:
 
 
 def refuse_crossed(lower: float, upper: float) -> None:
-    """Refuses thresholds of which a level would be both above and below.
+    """Refuses a lower threshold above the upper one.
 
     Raises:
         ArgumentError: if so.
@@ -108,7 +108,7 @@ def refuse_crossed(lower: float, upper: float) -> None:
 
 
 def nearest(points: Tensor, places: Tensor) -> Tensor:
-    """Finds the place nearest to each point, the last of equally near ones.
+    """Finds the place nearest to each point; ties go to the last place.
 
     Args:
         points: float [n, D].

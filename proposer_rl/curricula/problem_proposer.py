@@ -1,4 +1,4 @@
-"""The paper's Proposer, rewarded for each problem by itself: by first-order gain or by regret."""
+"""The paper's Proposer with a reward for every problem: first-order gain or regret."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 
 from proposer_rl.curricula.batches import device_of, levels_in
-from proposer_rl.curricula.bins import along_axes, counts_of_bins
-from proposer_rl.curricula.contract import Batch, Curriculum
+from proposer_rl.curricula.bins import CountingCurriculum
+from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.proposer import learnt_proposer
 from proposer_rl.curricula.student import Student, TaskStudent
 from proposer_rl.learning import PPO, PPOSettings, load_agent, located
@@ -26,8 +26,8 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space, Task, refuse_unfit_bins
 
 
-class ProblemProposer(Curriculum):
-    """Draws each of P problems from a policy, and trains it by the reward of each.
+class ProblemProposer(CountingCurriculum):
+    """Draws each of P problems from a policy, and trains the policy by the reward of each.
 
     At every proposal the policy sees what the student would do on probe levels of the target, draws
     the bin of each problem, and is rewarded for each, standardised over all that it drew. A few
@@ -60,7 +60,8 @@ class ProblemProposer(Curriculum):
         probe_levels: int = 16,
     ) -> None:
         refuse_unfit_bins(space)
-        self.agent, self.space, self.target = agent, space, target
+        super().__init__(space)
+        self.agent, self.target = agent, target
         self._settings, self._probe_levels = settings, probe_levels
         actor, _ = agent.readout()
         self._loss = ClipPPOLoss(
@@ -71,22 +72,20 @@ class ProblemProposer(Curriculum):
             normalize_advantage=True,
             functional=False,
         ).to(device_of(target.sample(1, torch.Generator())))  # its numbers are tensors
-        self._loss.set_keys(action=agent.action_key, sample_log_prob=agent.log_prob_key)
         self._parameters = [p for p in agent.parameters() if p.requires_grad]
         self._adam = torch.optim.Adam(
             self._parameters, lr=settings.learning_rate, eps=settings.adam_eps
         )
-        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._metrics: dict[str, float] = {}
 
     @abstractmethod
     def reward(
         self, student: Student, levels: Levels, rng: Streams
     ) -> tuple[Tensor, dict[str, float]]:
-        """Returns the rewards of levels [E], float [E], and metrics."""
+        """Computes the rewards of levels [E], float [E], and metrics."""
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Draws levels [n] from the policy, which learns from them at once.
+        """Draws levels [n] from the policy, and trains it on them at once.
 
         The policy draws P at a time, and learns from all that it drew.
 
@@ -107,36 +106,31 @@ class ProblemProposer(Curriculum):
         levels = levels_in(self.space, bins, rng.generator("levels"))
         reward, metrics = self.reward(student, levels, rng)
         drawn = {
-            agent.action_key: choices,
-            agent.log_prob_key: log_prob,
+            "action": choices,
+            "action_log_prob": log_prob,
             "advantage": reward.view(*choices.shape, 1),
         }
         self._learn(seen, TensorDict(drawn, choices.shape))
         self._metrics |= metrics
         return Batch(levels[:count], TensorDict({"bins": bins[:count]}, [count]))
 
-    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Counts the levels that came back."""
-        self._counts += counts_of_bins(batch.notes["bins"], self.space)
-
     def log(self) -> dict[str, Any]:
-        """Returns the last metrics of the policy, and how many levels of each bin came back."""
+        """Returns the last metrics of the policy, and counts of observed levels by bin."""
         if not self._metrics:
             return {}
-        counts, self._counts = self._counts, torch.zeros_like(self._counts)
-        return {**self._metrics, "histogram": along_axes(counts, self.space)}
+        return {**self._metrics, "histogram": self.histogram()}
 
     def learnt(self) -> dict[str, Any]:
-        """Returns the Proposer, without its optimiser."""
+        """Returns the Proposer without its optimiser."""
         return learnt_proposer(self.agent)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns also the Proposer and Adam's state."""
+        """Adds the Proposer and Adam's state."""
         own = learnt_proposer(self.agent) | {"adam": deepcopy(self._adam.state_dict())}
         return super().state_dict() | own
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned."""
         super().load_state_dict(state)
         load_agent(self.agent, TensorDict(state["proposer"]))
         self._adam.load_state_dict(deepcopy(state["adam"]))
@@ -145,9 +139,9 @@ class ProblemProposer(Curriculum):
         """Makes a few gradient steps on draws [times, 1, P]."""
         steps = []
         for _ in range(self._settings.epochs):
-            logits = self.agent(seen.copy())[self.agent.logits_key]  # [1, P, N]
+            logits = self.agent(seen.copy())["logits"]  # [1, P, N]
             everywhere = logits.expand(len(played), -1, -1, -1)
-            losses = self._loss(played.copy().set(self.agent.logits_key, everywhere))
+            losses = self._loss(played.copy().set("logits", everywhere))
             self._adam.zero_grad()
             (losses["loss_objective"] + losses["loss_entropy"]).backward()
             norm = nn.utils.clip_grad_norm_(self._parameters, self._settings.max_grad_norm)
@@ -163,7 +157,7 @@ class ProblemProposer(Curriculum):
 
 
 class FirstOrderProposer(ProblemProposer):
-    """Rewards each problem with its alignment, its first-order share of the target's gain.
+    """Rewards each problem with its alignment: its share of the target's first-order gain.
 
     The alignment of a level is the slope of its return along the direction of the parameters that
     raises the target's performance fastest (:mod:`proposer_rl.meta.first_order`).
@@ -197,7 +191,7 @@ class FirstOrderProposer(ProblemProposer):
     def reward(
         self, student: Student, levels: Levels, rng: Streams
     ) -> tuple[Tensor, dict[str, float]]:
-        """Returns the alignment of each level, by evaluations on either side of the student."""
+        """Computes the alignment of each level from evaluations on either side of the student."""
         target = self.target.sample(self._target_levels, rng.generator("target"))
         reached, direction = student.target_direction(target, self._measure)
         aligned = student.alignment(direction, levels, self._step)
@@ -248,7 +242,7 @@ class PairedProposer(ProblemProposer):
         self._seeds: list[int] = []
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Draws levels [n] from the policy, which learns from them at once."""
+        """Draws levels [n] from the policy, and trains it on them at once."""
         batch = super().propose(student, count, rng)
         seed = rng.generator("antagonist").initial_seed()  # of its actions on these levels
         batch.notes["seed"] = torch.full((count,), seed)
@@ -257,7 +251,7 @@ class PairedProposer(ProblemProposer):
     def reward(
         self, student: Student, levels: Levels, rng: Streams
     ) -> tuple[Tensor, dict[str, float]]:
-        """Returns the regret of each level."""
+        """Computes the regret on each level."""
         antagonist, protagonist = (
             each.performance(levels, rng.generator("regret"))["return"]
             for each in (self.antagonist, student)
@@ -270,7 +264,7 @@ class PairedProposer(ProblemProposer):
         }
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Lets the antagonist take as many steps on the levels.
+        """Trains the antagonist on the levels that the student has trained on.
 
         Raises:
             DivergedError: if a number of the antagonist is not finite.
@@ -289,10 +283,10 @@ class PairedProposer(ProblemProposer):
             self._learner.check()
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns also the antagonist."""
+        """Adds the antagonist."""
         return super().state_dict() | {"antagonist": self._learner.snapshot().to_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned."""
         super().load_state_dict(state)
         self._learner.restore(TensorDict(state["antagonist"], [1]))

@@ -1,4 +1,4 @@
-"""A bandit that trains each student on the bins in which it gets better, or worse, fastest."""
+"""Learning progress: trains on the bins in which performance changes fastest."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class LearningProgressCurriculum(BinCurriculum):
         self._episodes: list[Tensor] = []
 
     def score(self, student: Student, count: int, rng: Streams) -> None:
-        """Moves the averages by the performance on the probes, or in the episodes since."""
+        """Updates the averages by the performance on the probes, or by recent episodes."""
         seen = torch.full((self.space.size,), torch.nan)  # where nothing was
         if self._source == "exact":
             seen = self._probes.performance(student, rng)
@@ -94,7 +94,7 @@ class LearningProgressCurriculum(BinCurriculum):
         }
 
     def learn(self, bins: Tensor, outcome: TensorDictBase) -> None:
-        """Adds what episodes reached to the sums of their bins, if progress is measured by it."""
+        """Adds the results of episodes to the sums of their bins, if progress comes from them."""
         if self._source == "exact":
             return
         reached = outcome[self._probes.measure].float().cpu()
@@ -109,7 +109,7 @@ class LearningProgressCurriculum(BinCurriculum):
 
 
 def stretched(success: Tensor, q: float = Q) -> Tensor:
-    """Returns p (1 - q) / (p + q (1 - 2 p)) of success p, so that small ones count for more.
+    """Returns p (1 - q) / (p + q (1 - 2 p)) of success p, which gives small p more weight.
 
     Kanitscheider et al. 2021 (arXiv 2106.14876), with q = 0.1: a success of q is stretched to one
     half, 0 and 1 stay.
@@ -126,7 +126,7 @@ def stretched(success: Tensor, q: float = Q) -> Tensor:
 
 
 def progress_shares(progress: Tensor, exploration: float) -> Tensor:
-    """Returns shares [*B, N] in proportion to progress [*B, N], a part of them uniform.
+    """Returns shares [*B, N] in proportion to progress [*B, N], with a uniform part.
 
     Args:
         progress: not negative.

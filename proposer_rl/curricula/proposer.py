@@ -1,4 +1,4 @@
-"""A Proposer as a curriculum, and how it learns to be one."""
+"""The paper's Proposer as a curriculum, and the trainer that teaches it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from proposer_rl.task import Levels
 
 
 class ProposerCurriculum(LearnedCurriculum):
-    """Trains the student on the proposals of an agent that learns from replicas of the student.
+    """Lets an agent, the Proposer, choose the levels; it learns from replicas of the student.
 
     With a trainer, before each cycle K replicas of the student go through one episode of the
     meta-environment, and the Proposer's PPO learns from them. Without a trainer the Proposer is
@@ -69,7 +69,7 @@ class ProposerCurriculum(LearnedCurriculum):
         self._action: Tensor | None = None
 
     def improve(self, student: Student, rng: Streams) -> dict[str, Any]:
-        """Draws the levels through which the student is seen, and lets the trainer train."""
+        """Draws the levels on which the Proposer sees the student, and trains the Proposer."""
         self._proposed = 0
         if self.trainer is not None:
             return self.trainer.train(student, rng)
@@ -78,7 +78,7 @@ class ProposerCurriculum(LearnedCurriculum):
 
     @torch.no_grad()
     def propose(self, student: Student, count: int, rng: Streams) -> Levels:
-        """Draws levels [n] from the Proposer's policy, given what it sees of the student."""
+        """Draws levels [n] from the Proposer's policy, given its view of the student."""
         if self._action is None:  # the first batch can come within a cycle
             self._proposed = 0
         if self._action is None or self._proposed % self.action_repeat == 0:
@@ -88,11 +88,11 @@ class ProposerCurriculum(LearnedCurriculum):
         return levels[0]
 
     def learnt(self) -> dict[str, Any]:
-        """Returns the Proposer without its optimiser; nothing if it is frozen and not new."""
+        """Returns the Proposer without its optimiser; nothing if the Proposer is frozen."""
         return {} if self.trainer is None else learnt_proposer(self.agent)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns also the address of the cycle's streams, and the agent."""
+        """Adds the agent and the address of the cycle's random streams."""
         agent = (
             agent_weights(self.agent) if self.trainer is None else self.trainer.learner.snapshot()
         )
@@ -103,7 +103,7 @@ class ProposerCurriculum(LearnedCurriculum):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned, also within a cycle."""
+        """Restores what :meth:`state_dict` returned, also in the middle of a cycle."""
         super().load_state_dict(state)
         self.view.draw_levels(Streams(*state["streams"]))
         agent = TensorDict(state["proposer"], batch_size=[])
@@ -136,7 +136,7 @@ class ProposerCurriculum(LearnedCurriculum):
 
 
 class ProposerTrainer:
-    """Trains a Proposer by what its proposals do to K replicas of the student.
+    """Trains a Proposer by the effect of its proposals on K replicas of the student.
 
     Args:
         learner: PPO of the Proposer, whose environment is a :class:`SolverTrainingEnv` and whose
@@ -159,7 +159,7 @@ class ProposerTrainer:
         self.replicas = replicas or Replicas(learner)
 
     def curriculum(self, own_action: Literal["sample", "mode"]) -> ProposerCurriculum:
-        """Returns the curriculum of this Proposer while it learns."""
+        """Returns the curriculum of this Proposer, which goes on learning."""
         env = self.env
         return ProposerCurriculum(
             self.learner.agent,
@@ -206,5 +206,5 @@ class ProposerTrainer:
 
 
 def learnt_proposer(agent: ActorCritic) -> dict[str, Any]:
-    """Returns a Proposer's weights and what it observes, for its curriculum's state."""
+    """Returns a Proposer's weights and the names of what it observes, for a state."""
     return {"proposer": agent_weights(agent).to_dict(), "observed": agent.in_keys}

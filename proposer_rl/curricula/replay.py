@@ -1,17 +1,17 @@
-"""Curricula that keep levels and train on them again: PLR, robust PLR, ACCEL and their relatives.
+"""Curricula that replay levels from a buffer: PLR, robust PLR, ACCEL, NCC and TRACED.
 
-One loop with options, which is what the methods differ in:
+The methods are options of one loop:
 
-- PLR (Jiang et al. 2021, arXiv 2010.03934): with probability q the batch is drawn from the buffer,
-  else it is new; the Solver trains on either, and what it does there scores the levels.
-- robust PLR (arXiv 2110.02439): it trains on replayed levels alone; new ones are only played on.
-  Batch-synchronous (minimax, arXiv 2311.12716): at every update one new batch is scored and one is
-  replayed, so that several Solvers do the same thing at the same time.
-- ACCEL (Parker-Holder et al. 2022, arXiv 2203.01302): besides, what was trained on is edited, and
-  the children are scored like new levels.
-- With an exact score new levels cost no episodes, but evaluations.
-- NCC (arXiv 2505.20659): all scores are renewed before each draw, from a softmax over them. Its
-  inner problem, max over y of <y, s> + temperature * entropy(y), has that closed form.
+- PLR (Jiang et al. 2021, arXiv 2010.03934): with probability q a batch is drawn from the buffer,
+  otherwise it is new. The Solver trains on either, and its episodes score the levels.
+- Robust PLR (arXiv 2110.02439): the Solver trains on replayed levels, and only plays new ones.
+  Batch-synchronous (minimax, arXiv 2311.12716): in every update one new batch is scored and one is
+  replayed, so that several Solvers do the same at the same time.
+- ACCEL (Parker-Holder et al. 2022, arXiv 2203.01302): in addition, levels that were trained on are
+  edited, and their children are scored like new levels.
+- With an exact score, new levels cost evaluations instead of episodes.
+- NCC (arXiv 2505.20659): all scores are renewed before each draw, which follows their softmax, the
+  closed form of its inner problem, max over y of <y, s> + temperature * entropy(y).
 """
 
 from __future__ import annotations
@@ -61,33 +61,32 @@ SHOWN = 6  # levels of each kind that a reader is shown
 
 
 class ReplayCurriculum(Curriculum):
-    """Draws batches from a buffer of levels by their scores.
+    """Replays levels from a buffer by their scores, and adds new or edited ones.
 
     Args:
-        space: where levels come from that are not edited.
-        scorer: of levels.
+        space: from which new levels are drawn.
+        scorer: scores the levels.
         rule: how levels are drawn, and which one makes room for another.
-        new_levels: of the space, the bins that they come from: for some of its axes, by name, the
-            values that count; None for the whole space.
-        capacity: levels N of the buffer.
-        fill: share of the capacity that must have been scored before any is replayed.
-        replay_probability: q; has no effect where ``synchronous``.
+        new_levels: restricts new levels to some bins of the space: allowed values of some of its
+            axes, by name; None for the whole space.
+        capacity: number N of levels in the buffer.
+        fill: share of the capacity that must have been scored before levels are replayed.
+        replay_probability: q; has no effect if ``synchronous``.
         train_on_new: whether the student also trains on new levels.
-        synchronous: whether each proposal has one new batch that is scored, and one that is
-            replayed; None for yes, unless new levels are trained on.
-        edits: of each child; 0 for no children.
-        edit: makes children: levels [K, n] after so many small random edits each.
-        parents: of a batch of children: all that was trained on (``batch``), or the four of it with
-            the lowest difference of mean return and mean absolute advantage (``easy``).
-        renew: whether all scores are renewed before each draw, instead of those of what was trained
-            on.
-        co_learnability: what is added to the scores of the levels trained on before, for each unit
-            by which the scores of those trained on now have fallen (TRACED, arXiv 2506.19997).
+        synchronous: whether each proposal scores one new batch and replays another; None for the
+            opposite of ``train_on_new``.
+        edits: number of edits that make a child; 0 for no children.
+        edit: returns levels [K, n] after this number of small random edits each.
+        parents: of a batch of children: all levels that were trained on (``batch``), or the four of
+            them with the lowest difference of mean return and mean absolute advantage (``easy``).
+        renew: whether to renew all scores before each draw, instead of the scores of the levels
+            that were trained on.
+        co_learnability: how much the scores of the previous batch rise for each unit by which the
+            scores of this batch have fallen (TRACED, arXiv 2506.19997).
 
     Raises:
-        DivergedError: in :meth:`propose`, if there is no level with a score where one is to be
-            replayed.
-        ArgumentError: if there are to be edits and nothing makes them, or options contradict.
+        DivergedError: in :meth:`propose`, if a level is to be replayed and none has a score.
+        ArgumentError: if edits are asked for and the task has none, or options contradict.
     """
 
     state = ("_scored", "_came_back", "_before", "buffer", "_last")
@@ -115,7 +114,7 @@ class ReplayCurriculum(Curriculum):
         if train_on_new and synchronous:
             raise ArgumentError(
                 "train_on_new=true, synchronous=true: new levels are either trained on or only "
-                "scored; set one of them to false"
+                "scored; set one of the two to false"
             )
         if renew and co_learnability:
             raise ArgumentError(
@@ -124,11 +123,11 @@ class ReplayCurriculum(Curriculum):
             )
         if edits and edit is None:
             raise ArgumentError(
-                f"edits={edits}: the task has no edit(levels, count, generators) of its levels; "
+                f"edits={edits}: the task must define edit(levels, count, generators); otherwise "
                 "set edits=0"
             )
         self._edit, self._edits, self._easy = edit, edits, edits > 0 and parents == "easy"
-        # Levels are scored aside where they are new and not trained on, edited, or renewed.
+        # Levels are scored without training if they are new and not trained on, edited or renewed.
         aside = not train_on_new or edits or renew
         self.needs = scorer.needs if aside else scorer.asks
         self.required_results = (
@@ -144,10 +143,10 @@ class ReplayCurriculum(Curriculum):
         self._template = self._new_levels.sample(1, torch.Generator())[0]
         self._device = device_of(self._template)
         self.buffer = empty_buffer(self._template, self._capacity)
-        # Evidence [m] whose children, or exact scores, are due at the next proposal.
+        # Batches [m] whose children, or exact scores, are due at the next proposal.
         self._due: list[TensorDict] = []
         self._last: Levels = self.buffer["level"][:0]  # what was observed last, [m]
-        # "slot" and "key" [m] of the levels that were trained on the time before.
+        # "slot" and "key" [m] of the previous batch.
         self._before: dict[str, Tensor] = {}
         self._scored = 0  # new levels
         self._came_back = {"levels": 0, "replayed": 0}
@@ -166,7 +165,7 @@ class ReplayCurriculum(Curriculum):
         staleness: Share = ReplayRule.staleness,
         **settings: Any,
     ) -> ReplayCurriculum:
-        """Makes it for a run's space and edits: see :class:`Scorer` and :class:`ReplayRule`."""
+        """Makes it for a run's space and edits; see :class:`Scorer` and :class:`ReplayRule`."""
         rule = ReplayRule(
             prioritization=prioritization, temperature=temperature, best=best, staleness=staleness
         )
@@ -174,7 +173,7 @@ class ReplayCurriculum(Curriculum):
         return cls(run.task.space, scorer, rule, run.optional("edit"), **settings)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Returns levels [n], replayed or new."""
+        """Returns levels [n], all of them replayed or all of them new."""
         self._finish(student, rng)
         slots = torch.zeros(count, dtype=torch.int64)
         if replayed := self._explore(student, count, rng):
@@ -199,7 +198,7 @@ class ReplayCurriculum(Curriculum):
         return Batch(moved(levels, self._device), TensorDict(notes, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Scores the levels by the episodes on them, where these are what scores are made of."""
+        """Scores the levels, if scores come from episodes."""
         notes = dict(batch.notes.items())
         evidence = {"level": moved(batch.levels, CPU)}
         evidence |= {name: notes[name] for name in ("slot", "replayed", "key")}
@@ -215,7 +214,7 @@ class ReplayCurriculum(Curriculum):
             self._due.append(TensorDict(evidence, [len(batch)]))
 
     def log(self) -> dict[str, Any]:
-        """Returns how much was replayed, and statistics of the buffer."""
+        """Returns the share of replayed levels, and statistics of the buffer."""
         buffer, filled = self.buffer, self.buffer["filled"]
         if not bool(filled.any()):
             return {}
@@ -236,22 +235,22 @@ class ReplayCurriculum(Curriculum):
         return record
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns also what is due for the levels that were trained on."""
+        """Adds the levels whose exact scores or children are due."""
         return super().state_dict() | {"due": [packed(evidence) for evidence in self._due]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned."""
         super().load_state_dict(state)
         like = self.buffer.select("level")
         self._due = [unpacked(evidence, like) for evidence in state["due"]]
 
     def _finish(self, student: Student, rng: Streams) -> None:
-        """Scores exactly the levels that were trained on, and makes and scores their children."""
+        """Computes the exact scores, and the children, of levels that were trained on."""
         due, self._due = self._due, []
         for i, evidence in enumerate(due):
             which = (i,) if i else ()
             replayed = bool(evidence["replayed"][0])
-            # Where all scores are renewed, those of levels of the buffer need not be taken.
+            # If all scores are renewed anyway, levels of the buffer need no score here.
             if not self.scorer.from_episodes and not (self._renew and replayed):
                 scored = self._score(student, evidence["level"], rng, "trained", *which)
                 self._take(evidence, scored, unseen(len(evidence)))
@@ -263,7 +262,7 @@ class ReplayCurriculum(Curriculum):
     def _children(
         self, evidence: TensorDictBase, draw: torch.Generator
     ) -> tuple[Levels, dict[str, Tensor]]:
-        """Returns children [m] of levels that were trained on, and where they come from."""
+        """Edits levels that were trained on; returns the children [m] and their origin."""
         assert self._edit is not None  # or there are no edits
         some = parents_among(evidence)
         parents, slots = evidence["level"][some], evidence["slot"][some]
@@ -271,7 +270,7 @@ class ReplayCurriculum(Curriculum):
         return self._edit(parents.unsqueeze(0), self._edits, [draw])[0], origin
 
     def _explore(self, student: Student, count: int, rng: Streams) -> bool:
-        """Scores new levels as long as it takes; returns whether the next batch is replayed."""
+        """Scores as many new levels as are needed; returns whether to replay the next batch."""
         batches = 0
         while True:
             chance = torch.rand((), generator=rng.generator("replay", batches))
@@ -282,7 +281,7 @@ class ReplayCurriculum(Curriculum):
             if replayed and not bool(self.buffer["filled"].any()):
                 raise DivergedError(
                     f"on none of {self._scored} new levels did an episode end within a rollout, so "
-                    "that none has a score; longer rollouts (the horizon) may"
+                    "none has a score; try longer rollouts (the horizon)"
                 )
             if self._train_on_new or replayed:
                 return replayed
@@ -304,37 +303,37 @@ class ReplayCurriculum(Curriculum):
         *purpose: str | int,
         reached: Tensor | None = None,
     ) -> Scored:
-        """Scores levels [m] that nobody trains on; ``reached`` as in :meth:`_expected`."""
+        """Scores levels [m] that are not trained on; for ``reached`` see :meth:`_expected`."""
         before = self._expected(unseen(len(levels)) if reached is None else reached)
         return self.scorer(student, moved(levels, self._device), rng, *purpose, before=before)
 
     def _expected(self, reached: Tensor) -> Tensor:
-        """Returns what was ``reached`` [m], or if unknown the mean over the buffer."""
+        """Fills unknown entries of ``reached`` [m] with the mean over the buffer."""
         known = self.buffer["reached"]
         mean = known.where(known.isfinite(), torch.nan).nanmean()
         return reached.where(reached.isfinite(), mean.nan_to_num(-torch.inf))
 
     def _score_all(self, student: Student, rng: Streams) -> None:
-        """Renews all scores."""
+        """Scores all levels of the buffer anew."""
         filled, place = self.buffer["filled"], torch.arange(self._capacity)
-        # An empty slot holds no level that could be played: the first one stands in for it.
+        # Empty slots hold no level that could be played: the first level stands in for them.
         slots = place.where(filled, 0)
         levels, reached = self.buffer["level"][slots], self.buffer["reached"][slots]
         rescore(self.buffer, slots, *self._score(student, levels, rng, "all", reached=reached))
 
     def _take(self, evidence: Mapping[str, Any], scored: Scored, reached: Tensor) -> None:
-        """Takes the scores of levels that were trained on; new levels go into the buffer.
+        """Stores the scores of levels that were trained on; new levels enter the buffer.
 
         Args:
-            evidence: of the levels [m].
-            scored: them.
-            reached: the returns, float [m]; minus infinity where these are not known.
+            evidence: what is known about the levels [m].
+            scored: their scores.
+            reached: their returns, float [m]; minus infinity where unknown.
         """
         if not bool(evidence["replayed"][0]):
             self._add(evidence["level"], scored, reached=reached)
             return
         slots = evidence["slot"]
-        # Another level may have taken the place of one that was long on its way.
+        # By the time a result comes back, another level may have taken the slot.
         there, before = self.buffer["key"][slots] == evidence["key"], self.buffer["score"][slots]
         new = (entry.where(there, -torch.inf) for entry in (*scored, reached))
         rescore(self.buffer, slots, *new)
@@ -342,7 +341,7 @@ class ReplayCurriculum(Curriculum):
             self._credit(before, slots)
 
     def _credit(self, score: Tensor, slots: Tensor) -> None:
-        """Credits the levels trained on before with how far the scores [m] in these slots fell."""
+        """Raises the scores of the previous batch by how much the scores [m] of this one fell."""
         fell = (score - self.buffer["score"][slots]).mean()
         if before := self._before:
             there = self.buffer["key"][before["slot"]] == before["key"]  # not evicted since
@@ -355,7 +354,7 @@ class ReplayCurriculum(Curriculum):
         return moved(self._new_levels.sample(count, rng.generator(*purpose)), CPU)
 
     def _shown(self) -> dict[str, Levels]:
-        """Returns levels of the buffer for reports, by their captions."""
+        """Returns levels of the buffer to show in reports, by caption."""
         buffer = self.buffer[self.buffer["filled"]]
         shown = {
             "highest scores": buffer["score"].topk(min(SHOWN, len(buffer))).indices,
@@ -369,8 +368,8 @@ class ReplayCurriculum(Curriculum):
 def parents_among(evidence: TensorDictBase) -> Tensor:
     """Returns the places of the parents of n children among n levels: int64 [n].
 
-    Every level that was trained on is one; or, where evidence [n] has the entry ``easy``, the
-    few levels with most of it.
+    Every level that was trained on is a parent; but if evidence [n] has the entry ``easy``, only
+    the few levels with the highest values are.
     """
     count = len(evidence)
     if "easy" not in evidence.keys():
@@ -380,7 +379,7 @@ def parents_among(evidence: TensorDictBase) -> Tensor:
 
 
 def easiness(student: Student, outcome: TensorDictBase) -> Tensor:
-    """Returns mean absolute advantage minus mean return, highest for "easy" parents: [n].
+    """Returns mean absolute advantage minus mean return [n]; "easy" parents have the highest.
 
     The authors' code (dcd) takes the levels with the lowest return minus value loss.
     """

@@ -1,4 +1,4 @@
-"""Curricula that sample new levels: as they come, or the best of many (SFL)."""
+"""Curricula of new levels: plain samples, or the best of many candidates (SFL)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class SamplingCurriculum(Curriculum):
 
 
 class SelectionCurriculum(Curriculum):
-    """Scores many new levels every few batches, and proposes the best of them and new ones.
+    """Scores many candidates every few batches, and proposes the best of them and new levels.
 
     SFL (Rutherford et al. 2024, "No Regrets", arXiv 2408.15099, algorithm 1), with learnability as
     the score. The levels that are kept are drawn uniformly and with replacement; nothing is scored
@@ -83,11 +83,11 @@ class SelectionCurriculum(Curriculum):
         rollouts: Count = 8,
         **settings: Any,
     ) -> SelectionCurriculum:
-        """Makes it for a run's space, with a scorer: see :class:`Scorer`."""
+        """Makes it for a run's space, with a scorer; see :class:`Scorer`."""
         return cls(run.task.space, Scorer(score, source, rollouts), **settings)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Levels:
-        """Returns levels [n]: some of those kept, then new ones.
+        """Returns levels [n]: kept ones, then new ones.
 
         Raises:
             DivergedError: if fewer of the candidates have a score than are kept.
@@ -104,7 +104,7 @@ class SelectionCurriculum(Curriculum):
         return levels
 
     def _select(self, student: Student, rng: Streams) -> None:
-        """Scores new candidates, and keeps the best of them."""
+        """Scores new candidates and keeps the best."""
         levels = self._new_levels.sample(self._candidates, rng.generator("candidates"))
         scored = self.scorer(student, levels, rng)
         known = int(scored.score.isfinite().sum())
@@ -118,7 +118,7 @@ class SelectionCurriculum(Curriculum):
         self.kept = levels[best.indices[: self._keep].to(device_of(levels))]
 
     def log(self) -> dict[str, Any]:
-        """Returns the scores of what is kept, and the best levels."""
+        """Returns the scores of the kept levels, and the best levels."""
         if not len(self.kept):
             return {}
         return {

@@ -1,17 +1,17 @@
-"""Scores levels by how much there is to learn there, from episodes or from a student itself.
+"""Scores levels by how much a student can learn there, from episodes or by evaluation.
 
-A score from episodes reads a rollout [n, T], of which only episodes count that end in it: it is
-the mean over the steps of each, then the mean over the episodes of a level; minus infinity where
-none ends (``gradient_norm``: over all steps). A score from evaluation asks the student
-instead, and needs no episode.
+A score from episodes reads a rollout [n, T]. Only episodes that end within it count: the score is
+the mean over the steps of each, then over the episodes of a level, and minus infinity if none ends
+(``gradient_norm``: over all steps). A score from evaluation asks the student instead, and needs no
+episodes.
 
 With V the critic, gamma the discount and lambda the decay of the traces,
 
     delta_t = r_t + gamma V(s_(t+1)) - V(s_t),    V = 0 where the episode terminated,
 
-the error of one step, A_t the generalised advantage, which is the sum of
-(gamma lambda)^i delta_(t+i), p the probability of success, J the expected return, J* the largest
-that any policy reaches, and R the highest return ever seen on the level:
+the error of one step, A_t the generalised advantage, that is the sum of
+(gamma lambda)^i delta_(t+i), p the probability of success, J the expected return, J* the highest
+expected return of any policy, and R the highest return ever seen on the level:
 
 =======================  =============================  ====================================
 score                    from episodes                  from evaluation
@@ -25,13 +25,12 @@ gradient_norm            squared norm of a policy       squared norm of the grad
                          gradient
 =======================  =============================  ====================================
 
-Another score is a function of one's own, of outcomes: see :class:`Scorer`.
+You can also score outcomes by a function of your own; see :class:`Scorer`.
 
-Where a loop gives what came of an episode but no rollout, the episode counts as one step, and in
-the critic's place stands the return of the level when it was trained on before (of a new level the
-mean of these over the buffer): value losses are then absolute learning progress (Portelas et al.
-2019, arXiv 1910.07224), and only ``gradient_norm`` cannot be had. A score that the loop gives
-itself takes the place of all this.
+If a loop reports outcomes without rollouts, an episode counts as one step, and the previous return
+on the level (for a new level the mean of these over the buffer) takes the place of the critic.
+Value losses are then absolute learning progress (Portelas et al. 2019, arXiv 1910.07224), and only
+``gradient_norm`` is unavailable. A score that the loop reports itself replaces all of this.
 
 Sources: value losses: Jiang et al. 2021 (arXiv 2010.03934, section 3.1; 2110.02439, section 5);
 MaxMC: the latter, appendix; learnability: Rutherford et al. 2024 (arXiv 2408.15099, section 4),
@@ -61,11 +60,11 @@ from proposer_rl.task import Levels, NoSuccessError
 Source = Literal["episodes", "exact"]
 
 OwnScore = Callable[[Student, TensorDictBase], Tensor]
-"""A score of levels [n] by what came of episodes on them: float [n].
+"""A function of your own that scores the outcomes of levels [n]: float [n].
 
-Called with the student, whose ``gamma`` and ``lmbda`` are those of a critic if there is one, and
-the outcome, see :func:`~proposer_rl.curricula.outcome_of`. Higher is more to learn; minus infinity
-where nothing can be said.
+Called with the student, which has the ``gamma`` and ``lmbda`` of its critic, and the outcome; see
+:func:`~proposer_rl.curricula.outcome_of`. A higher score means more to learn; minus infinity
+means no score.
 """
 
 ASKS = {"gradient_norm": ("policy_gradient_norms",)}  # of a student, from episodes
@@ -92,8 +91,8 @@ def learnability(student: Student, levels: Levels) -> Tensor:
     performance = student.exact_performance(levels)
     if "success" not in performance.keys():
         raise NoSuccessError(
-            "learnability: this task tells no success, only the return; of the scores regret and "
-            "gradient norms take that"
+            "learnability: this task tells no success, only the return; the scores regret and "
+            "gradient_norm need only that"
         )
     success = performance["success"]
     return success * (1 - success)
@@ -107,17 +106,17 @@ EXACT: dict[str, tuple[tuple[str, ...], Callable[[Student, Levels], Tensor]]] = 
     ),
     "gradient_norm": (("gradient_norms",), lambda s, levels: s.gradient_norms(levels)),
 }
-"""The functions that each score needs of a student, and its formula: float [n]."""
+"""For each score the functions of a student that it needs, and its formula: float [n]."""
 
 
 class Episodes(NamedTuple):
-    """The episodes of a rollout [n, T] that end in it.
+    """The episodes that end within a rollout [n, T].
 
     Attributes:
-        weight: of every step, float64 [n, T]: 1 / (steps of its episode), so that those of an
+        weight: of every step, float64 [n, T]: 1 / (steps of its episode), so that the weights of an
             episode add up to 1; 0 for steps of an episode that does not end.
-        ended: episodes of each level, int64 [n].
-        successes: those of them that were a success, int64 [n].
+        ended: number of episodes on each level, int64 [n].
+        successes: number of those that were a success, int64 [n].
         total: sum of their undiscounted returns, float64 [n].
         best: the highest of these, float64 [n]; minus infinity without episodes.
     """
@@ -150,7 +149,7 @@ def episodes(rollout: TensorDictBase) -> Episodes:
 
 
 class Scored(NamedTuple):
-    """Levels' scores, and the highest returns ever seen there.
+    """Scores of levels, and the highest returns ever seen on them.
 
     Attributes:
         score: float64 [n].
@@ -162,25 +161,25 @@ class Scored(NamedTuple):
 
 
 def unseen(count: int) -> Tensor:
-    """Returns the highest return of levels [n] that nobody has played yet."""
+    """Returns the highest returns of levels [n] that nobody has played: minus infinity."""
     return torch.full((count,), -torch.inf)
 
 
 class Scorer:
-    """One of the scores, from one of its sources, or a function of one's own.
+    """Scores levels by one of the scores above, or by a function of your own.
 
     Args:
-        score: its name, see the table above; or, from episodes, an :data:`OwnScore` or the dotted
+        score: its name in the table above; or, from episodes, an :data:`OwnScore` or the dotted
             name of one, ``my_module.my_score``.
-        source: whether it is read off episodes or asked of the student.
-        rollouts: played on each level that is scored without training on it, from episodes.
+        source: whether the score comes from episodes or from an evaluation of the student.
+        rollouts: number of rollouts on each level that is scored without training on it.
 
     Attributes:
-        from_episodes: whether levels are scored by playing on them.
-        needs: what scoring levels asks of a student, that nobody trains on.
-        asks: what scoring those that were trained on asks of it.
-        required_results: entries of an outcome that this needs beside the return.
-        plays_for: of those, what playing on levels has to tell.
+        from_episodes: whether the score comes from episodes.
+        needs: functions of a student that it calls to score levels without training on them.
+        asks: functions of a student that it calls to score levels that were trained on.
+        required_results: entries of an outcome that it needs besides the return.
+        plays_for: those of them that playing on levels has to provide.
 
     Raises:
         ArgumentError: if there is no such score, or not from this source.
@@ -220,11 +219,10 @@ class Scorer:
         """Scores levels [n] by the outcome of training on them.
 
         Args:
-            student: whose critic and discount count.
+            student: provides critic and discount.
             outcome: with a ``score``, a ``rollout``, or neither.
             best: see :meth:`of_rollouts`.
-            before: the return of each level when it was trained on before, float [n]; minus
-                infinity where nothing is known.
+            before: the previous return on each level, float [n]; minus infinity if unknown.
         """
         if self._own is not None:
             reached = outcome["return"].float().cpu()
@@ -245,10 +243,10 @@ class Scorer:
         """Scores levels [n] by rollouts on them, [n, T] each.
 
         Args:
-            student: whose critic and discount count.
+            student: provides critic and discount.
             rollouts: with values, as ``Student.play`` returns them.
-            best: the highest returns seen on these levels before, float [n]; minus infinity
-                where there was none.
+            best: the highest returns seen on these levels so far, float [n]; minus infinity for
+                none.
         """
         split = [episodes(rollout) for rollout in rollouts]
         _, *numbers = zip(*split, strict=True)  # weights may be of several lengths
@@ -283,7 +281,7 @@ class Scorer:
         *purpose: str | int,
         before: Tensor | None = None,
     ) -> Scored:
-        """Scores levels [n] that nobody trains on; the student counts the cost.
+        """Scores levels [n] without training on them; the student counts the cost.
 
         Args:
             student: that would be trained.
@@ -328,17 +326,17 @@ class Scorer:
         return self.of_outcome(student, outcome, best, before)
 
     def _look_at(self, answers: Tensor) -> None:
-        """Warns, once, if the yield is of groups of one answer, none of which can be mixed."""
+        """Warns once if the yield is taken of single answers, which are never mixed."""
         if self._name == "yield" and not self._warned and single(answers):
             self._warned = True
             warnings.warn(
-                "score=yield: is 0 of a single answer; tell episodes= of several, or use "
+                "score=yield: is always 0 of a single answer; tell episodes= of several, or use "
                 "learnability",
                 stacklevel=2,
             )
 
     def _by_own(self, student: Student, outcome: TensorDictBase) -> Tensor:
-        """Returns one's own score of an outcome [n], float64."""
+        """Scores an outcome [n] by a function of your own: float64 [n]."""
         assert self._own is not None
         score, shape = self._own(student, outcome), outcome.batch_size
         if not isinstance(score, Tensor) or score.shape != shape or bool(score.isnan().any()):
@@ -348,7 +346,7 @@ class Scorer:
 
 
 def mixed(p: Tensor, answers: Tensor | float) -> Tensor:
-    """Returns the probability that not all answers to an item are alike.
+    """Returns the probability that the answers to an item are not all alike.
 
     Args:
         p: probability of a right one.
@@ -362,12 +360,12 @@ def mixed(p: Tensor, answers: Tensor | float) -> Tensor:
 
 
 def single(answers: Tensor) -> bool:
-    """Returns whether there are groups, numbers of answers, and none of them has several."""
+    """Returns whether there are groups of one answer, and none of several."""
     return bool((answers == 1).any()) and not bool((answers > 1).any())
 
 
 def _own_score(score: str | OwnScore) -> OwnScore | None:
-    """Returns the function that a score is or names with dots; None for one of the table."""
+    """Finds a function of your own, given or named with dots; None for a built-in score."""
     if not isinstance(score, str):
         return score
     if "." not in score:
@@ -380,7 +378,7 @@ def _own_score(score: str | OwnScore) -> OwnScore | None:
 
 
 def _of_returns(name: str, outcome: Mapping[str, Tensor], best: Tensor, before: Tensor) -> Scored:
-    """Returns a score of levels [n] from returns and success alone; see the module's text."""
+    """Scores levels [n] by returns and success alone; see the description above."""
     reached = outcome["return"].double()
     success = outcome.get("success", torch.zeros_like(reached)).double()
     value = before.double().where(before.isfinite(), reached)

@@ -1,4 +1,4 @@
-"""Self-paced learning: a Gaussian over the space that moves to the target as performance allows."""
+"""Self-paced learning (SPDL): a Gaussian moves to the target as fast as performance allows."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
-from proposer_rl.curricula.contract import Batch, Curriculum
+from proposer_rl.curricula.bins import CountingCurriculum, Measure
+from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.points import Place, Points
 from proposer_rl.curricula.student import Student
 from proposer_rl.meta.assembly import Components
@@ -30,7 +30,7 @@ SAMPLED = 1000  # levels of the target, whose mean and deviation are taken
 SLACK = 1e-4  # of the constraints, within which a solution is taken
 
 
-class SelfPacedCurriculum(Curriculum):
+class SelfPacedCurriculum(CountingCurriculum):
     """Draws levels from a Gaussian that moves towards the target's.
 
     A level is a point of the box [-1, 1]^D that the space's coordinates span, drawn from a normal
@@ -81,7 +81,8 @@ class SelfPacedCurriculum(Curriculum):
         measure: Measure = "success",
         rounded: bool = True,
     ) -> None:
-        self.space, self._points = space, Points(space, rounded)
+        super().__init__(space)
+        self._points = Points(space, rounded)
         self.required_results = ("success",) if measure == "success" else ()
         self._limits = delta, epsilon, least_deviation
         self._every, self._measure = episodes, measure
@@ -99,16 +100,15 @@ class SelfPacedCurriculum(Curriculum):
         # Since the last step: points [m, D], their log densities and performance [m].
         self._episodes: list[dict[str, Tensor]] = []
         self._expected: float | None = None  # performance at the last step
-        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
 
     @classmethod
     def create(cls, run: Components, **settings: Any) -> SelfPacedCurriculum:
-        """Makes it for a run's space, its target and the shares of the bins in that."""
+        """Makes it for a run's space, its target and the target's shares of the bins."""
         task = run.task
         return cls(task.space, task.target, task.target_shares, **settings)
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Draws points from the Gaussian, and returns levels [n] there."""
+        """Draws points from the Gaussian, and returns the levels [n] there."""
         shape = count, self._points.size
         shares = torch.rand(shape, generator=rng.generator("choices"), dtype=torch.float64)
         points, log_density = draw_in_box(self.mean, self.deviation, shares)
@@ -117,20 +117,19 @@ class SelfPacedCurriculum(Curriculum):
         return Batch(levels, TensorDict(notes, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Adds episodes, and makes a step where there are enough."""
-        self._counts += counts_of_bins(batch.notes["bins"], self.space)
+        """Collects episodes, and moves the Gaussian when there are enough."""
+        super().observe(student, batch, outcome)
         some = {name: batch.notes[name] for name in ("points", "log_density")}
         self._episodes.append({**some, "reached": outcome[self._measure].double().cpu()})
         if sum(len(some["reached"]) for some in self._episodes) >= self._every:
             self._step()
 
     def log(self) -> dict[str, Any]:
-        """Returns counts of levels by bin, the Gaussian, and how far it is from the target."""
+        """Returns counts of levels by bin, the Gaussian, and its divergence from the target."""
         if not bool(self._counts.any()):
             return {}
-        counts, self._counts = self._counts, torch.zeros_like(self._counts)
         return {
-            "histogram": along_axes(counts, self.space),
+            "histogram": self.histogram(),
             "means": self.mean.tolist(),
             "deviations": self.deviation.tolist(),
             "target_divergence": divergence(self._now, self._target)[0],
@@ -167,7 +166,7 @@ class Gaussian(NamedTuple):
 
 
 def draw_in_box(mean: Tensor, deviation: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns points of the box [-1, 1]^D drawn from a Gaussian, and the logs of their densities.
+    """Draws points of the box [-1, 1]^D from a Gaussian; returns them and their log densities.
 
     Args:
         mean: within the box, float64 [D].
@@ -204,7 +203,7 @@ def divergence(one: Gaussian, other: Gaussian) -> tuple[float, Floats]:
 def expected_performance(
     one: Gaussian, points: Floats, log_density: Floats, reached: Floats
 ) -> tuple[float, Floats]:
-    """Returns the mean of what was reached, if points were drawn from a Gaussian, and its gradient.
+    """Estimates the mean performance under a Gaussian from episodes, and its gradient.
 
     Each episode has the weight of its density in the Gaussian over that with which it was drawn;
     weights are normalised.
@@ -237,7 +236,7 @@ def step_towards(
     epsilon: float,
     least: float,
 ) -> tuple[Gaussian, float]:
-    """Returns the Gaussian near the present one that is nearest to the target, and performs.
+    """Returns the Gaussian nearest to the target that is in reach and performs well enough.
 
     The minimum of KL(p, target) over Gaussians p with KL(p, now) <= epsilon and an expected
     performance of at least delta, by sequential quadratic programming (SciPy's SLSQP). Where none

@@ -1,8 +1,8 @@
-"""The functions that a curriculum may ask of the student that it proposes to.
+"""The functions of a student that a curriculum may ask for.
 
-Most curricula ask for nothing; others name what they need (:attr:`Curriculum.needs`), so that a
-loop of any kind gives that alone, and a student that lacks something is refused before a run
-begins. :class:`TaskStudent` is that of this library, which can do all that its task allows.
+Most curricula ask for none. The others list what they need in :attr:`Curriculum.needs`, so that any
+training loop has to provide only that, and a student that lacks something is refused before a run
+begins. :class:`TaskStudent` is the student of this library's own loop.
 """
 
 from __future__ import annotations
@@ -36,28 +36,28 @@ VALUE = "state_value"  # the critic's entry in a rollout
 
 
 class UnfitStudentError(TypeError):
-    """A student lacks what a curriculum needs; the message is a line that says what."""
+    """A student lacks what a curriculum needs; the message is one line that names it."""
 
 
 class Student:
-    """A student as a curriculum sees it, and a meter of what it asked of the student.
+    """A student as a curriculum sees it, with counters of what the curriculum asked for.
 
-    What a student can do is a function: given to the constructor, or a method of a subclass. Levels
-    are [n] for any n unless it says otherwise; results are without gradients. Asking for a function
-    that it lacks raises :class:`UnfitStudentError`.
+    Each ability of a student is a function, given to the constructor or defined by a subclass.
+    Levels are [n] for any n unless stated otherwise; results have no gradients. Using a function
+    that the student lacks raises :class:`UnfitStudentError`.
 
     Args:
-        gamma, lmbda: discount, and decay of the traces of generalised advantages, by which
-            curricula read a critic.
-        batch_size: levels P that :attr:`play` takes at once; None for any number.
-        can: functions by their names, such as ``performance=evaluate``.
+        gamma, lmbda: discount, and decay of generalised advantages, with which curricula read the
+            values of a critic.
+        batch_size: number P of levels that :attr:`play` takes at once; None for any number.
+        can: functions by name, such as ``performance=evaluate``.
 
     Attributes:
-        frames: environment steps that it was played for on the curriculum's account.
-        evaluations: levels on which it was evaluated for it.
+        frames: environment steps that were played for the curriculum.
+        evaluations: levels that were evaluated for the curriculum.
 
     Raises:
-        ValueError: for a name that is none of these functions'.
+        ArgumentError: for an unknown name.
 
     Example:
         >>> student = Student(optimal_return=lambda levels: torch.ones(levels.shape))
@@ -66,38 +66,39 @@ class Student:
     """
 
     play: Callable[[Levels, torch.Generator], TensorDictBase]
-    """A rollout [n, T] on at most ``batch_size`` levels, on which nobody is trained.
+    """Plays on at most ``batch_size`` levels without training: a rollout [n, T].
 
-    TorchRL's, with ``state_value`` where a score reads a critic; or only an outcome [n], as
-    :func:`~proposer_rl.curricula.outcome_of` describes it. Actions are drawn from the generator.
+    The rollout is TorchRL's, with ``state_value`` if a score reads a critic. An outcome [n] as of
+    :func:`~proposer_rl.curricula.outcome_of` may take its place. Actions are drawn from the
+    generator.
     """
     performance: Callable[[Levels, torch.Generator], TensorDictBase]
-    """``return`` and, where there is one, ``success`` on each level: a tensordict [n].
+    """Returns ``return`` and, if the task has one, ``success`` on each level: a tensordict [n].
 
-    Expectations, or estimates from episodes.
+    These are expectations, or estimates from episodes.
     """
     exact_performance: Callable[[Levels], TensorDictBase]
-    """``performance`` where it is exact, so that nothing is drawn."""
+    """Returns ``performance`` if it is exact, so that no generator is needed."""
     probe: Callable[[Levels], Tensor]
-    """The student's behaviour on probe levels [C], as a Proposer sees it: float [C, ...]."""
+    """Returns the student's behaviour on probe levels [C], for a Proposer: float [C, ...]."""
     optimal_return: Callable[[Levels], Tensor]
-    """The largest expected return that any policy reaches on each level, float [n]."""
+    """Returns the highest expected return of any policy on each level, float [n]."""
     gradient_norms: Callable[[Levels], Tensor]
-    """Squared length of the gradient of the return on each level, float [n]."""
+    """Returns the squared length of the gradient of the return on each level, float [n]."""
     policy_gradient_norms: Callable[[TensorDictBase], Tensor]
-    """Squared length of the policy gradient of each level of a rollout [n, T], float [n]."""
+    """Returns the squared length of each level's policy gradient in a rollout [n, T], float [n]."""
     target_direction: Callable[[Levels, str], tuple[Tensor, Direction]]
-    """Performance on levels [E] of the target, float [], and what raises it fastest.
+    """Returns performance on levels [E] of the target, float [], and the direction that raises it.
 
     The second argument is the measure; see :mod:`proposer_rl.meta.first_order`.
     """
     alignment: Callable[[Direction, Levels, float], Tensor]
-    """Slope of the return on each level along a direction of the parameters, float [n].
+    """Returns the slope of the return on each level along a direction of the parameters, float [n].
 
-    The last argument is the step of the differences, in learning rates.
+    The last argument is the step of the finite differences, in learning rates.
     """
     snapshot: Callable[[], TensorDict]
-    """All that training changes of the student, batch []."""
+    """Returns all of the student that training changes, batch []."""
 
     def __init__(
         self,
@@ -115,12 +116,12 @@ class Student:
             setattr(self, name, function)
 
     def spend(self, *, frames: int = 0, evaluations: int = 0) -> None:
-        """Counts frames and evaluations that were spent on the curriculum's account."""
+        """Adds to the counters of frames and evaluations."""
         self.frames += frames
         self.evaluations += evaluations
 
     def lacks(self, name: str) -> str | None:
-        """Returns why the student lacks the function of that name; None if it has it."""
+        """Returns why the student lacks this function; None if the student has it."""
         if name in vars(self) or hasattr(type(self), name):
             return None
         _, *given = inspect.signature(getattr(TaskStudent, f"_{name}")).parameters
@@ -149,12 +150,12 @@ def require(student: Student, needs: Iterable[str], who: str) -> None:
 
 
 class TaskStudent(Student):
-    """One of the Solvers of a task that train by PPO, which can do all that the task allows.
+    """A Solver that trains by PPO on a task, and can do all that the task allows.
 
     Args:
         task: that evaluates it.
-        learner: of K Solvers.
-        replica: its place among them.
+        learner: PPO of K Solvers.
+        replica: the number of this one among them.
     """
 
     def __init__(self, task: Task, learner: PPO, replica: int = 0) -> None:
@@ -169,7 +170,7 @@ class TaskStudent(Student):
         self._learner = learner if learner.copies == 1 else learner.replica(replica)
 
     def lacks(self, name: str) -> str | None:
-        """Returns why the task does not allow the function of that name; None if it does."""
+        """Returns why the task does not allow this function; None if it does."""
         kinds: dict[str, tuple[type, str]] = {
             "optimal_return": (OptimalTask, "optimal_return(levels)"),
             **dict.fromkeys(
@@ -179,7 +180,7 @@ class TaskStudent(Student):
         }
         task = type(self._task).__name__
         if name == "exact_performance" and not self._task.exact_performance:
-            return f"{task} tells performance by playing, which is not exact"
+            return f"{task} measures performance by playing, which is not exact"
         if name in kinds and not isinstance(self._task, kinds[name][0]):
             return f"{task} must define {kinds[name][1]}"
         return None
@@ -238,7 +239,7 @@ class TaskStudent(Student):
         return self._task.spectators(self._learner)
 
     def _filled_up(self, levels: Levels) -> Levels:
-        """Repeats the last of levels [n], so that there are as many as an environment [1, P] takes.
+        """Repeats the last of levels [n] until they fill an environment [1, P].
 
         Returns:
             [1, P].
@@ -253,7 +254,7 @@ class TaskStudent(Student):
 
 
 def advantages(student: Student, rollout: TensorDictBase, lmbda: float | None = None) -> Tensor:
-    """Returns generalised advantages A_t, not standardised: float64 [*B, n, T].
+    """Computes generalised advantages A_t, not standardised: float64 [*B, n, T].
 
     Args:
         student: whose discount and decay of traces are used.
@@ -265,20 +266,20 @@ def advantages(student: Student, rollout: TensorDictBase, lmbda: float | None = 
     """
     for steps in (rollout, rollout["next"]):
         values(steps)
-    estimate = gae(student.gamma, student.lmbda if lmbda is None else lmbda, VALUE)
+    estimate = gae(student.gamma, student.lmbda if lmbda is None else lmbda)
     return estimate(rollout.copy())["advantage"].squeeze(-1).double()
 
 
 def values(steps: TensorDictBase) -> Tensor:
-    """Returns what a critic has written of steps, float [*B, 1].
+    """Returns the critic's values of steps, float [*B, 1].
 
     Raises:
-        ArgumentError: if it has not.
+        ArgumentError: if the steps have no values.
     """
     if VALUE not in steps.keys():
         raise ArgumentError(
-            f"rollout: has no {VALUE} in every step and next, which this curriculum reads; have a "
-            "critic write it first, as GAE does, or choose a score that needs none"
+            f"rollout: lacks {VALUE} at each step and in next, which this curriculum needs; let a "
+            "critic write it first, as GAE does, or use a score that needs no critic"
         )
     value: Tensor = steps[VALUE]
     return value

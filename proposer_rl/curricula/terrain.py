@@ -1,4 +1,4 @@
-"""Terrain levels: a row up after a success, a row down after a failure, anywhere after the last."""
+"""Terrain levels: one row up after a success, one down after a failure."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from annotated_types import Ge
 from tensordict import TensorDict, TensorDictBase
 
 from proposer_rl.curricula.batches import levels_in
-from proposer_rl.curricula.bins import Measure, along_axes, counts_of_bins
-from proposer_rl.curricula.contract import Batch, Curriculum
+from proposer_rl.curricula.bins import CountingCurriculum, Measure
+from proposer_rl.curricula.contract import Batch
 from proposer_rl.curricula.points import refuse_crossed
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import ArgumentError, checked
@@ -20,8 +20,8 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import Space, refuse_many_bins
 
 
-class RowsCurriculum(Curriculum):
-    """The rule of ``legged_gym`` for robots on terrains whose rows are harder and harder.
+class RowsCurriculum(CountingCurriculum):
+    """Moves robots between rows of growing difficulty, by the rule of ``legged_gym``.
 
     A robot whose level in row r came to at least ``upper`` gets one in row r + 1 next, one whose
     level came to less than ``lower`` one in row r - 1, others stay; there is none below the first.
@@ -71,15 +71,15 @@ class RowsCurriculum(Curriculum):
         refuse_many_bins(space)
         # The number of a bin is (before * rows + row) * after + rest.
         self._before, self._after = prod(sizes[:axis]), prod(sizes[axis + 1 :])
-        self.space, self._start = space, min(start, self._rows - 1)
+        super().__init__(space)
+        self._start = min(start, self._rows - 1)
         self.required_results = ("success",) if measure == "success" else ()
         self._lower, self._upper, self._measure = lower, upper, measure
-        self._counts = torch.zeros(space.size, dtype=torch.int64)  # of levels that came back
         self._last = torch.zeros(0, dtype=torch.int64)  # rows of the last batch, [n]
         self._queue = torch.zeros(0, dtype=torch.int64)  # rows [m] of the next levels
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
-        """Returns levels [n] in the rows that are next."""
+        """Returns levels [n] in the rows that are next in the queue."""
         next_rows, self._queue = self._queue[:count], self._queue[count:]
         uniform = partial(torch.randint, size=(count,), generator=rng.generator("choices"))
         first, anywhere = uniform(self._start + 1), uniform(self._rows)
@@ -91,22 +91,21 @@ class RowsCurriculum(Curriculum):
         return Batch(levels, TensorDict({"bins": bins, "row": rows}, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        """Appends the rows that follow to those that are next."""
+        """Appends the next rows of the robots to the queue."""
+        super().observe(student, batch, outcome)
         reached = outcome[self._measure].double().cpu()
         move = (reached >= self._upper).long() - (reached < self._lower).long()
-        self._counts += counts_of_bins(batch.notes["bins"], self.space)
         self._queue = torch.cat([self._queue, (batch.notes["row"] + move).clamp(min=0)])
 
     def log(self) -> dict[str, Any]:
-        """Returns counts of levels by bin, and of the last batch the mean row and the last's share.
+        """Returns counts of levels by bin, and the mean row and the share of the last row.
 
         Rows count from 0.
         """
         if not len(self._last):
             return {}
-        counts, self._counts = self._counts, torch.zeros_like(self._counts)
         return {
-            "histogram": along_axes(counts, self.space),
+            "histogram": self.histogram(),
             "mean_row": float(self._last.double().mean()),
             "last_row": float((self._last == self._rows - 1).double().mean()),
         }

@@ -1,4 +1,4 @@
-"""The outer loop: a Solver, a curriculum and a budget become a folder of measurements."""
+"""The outer loop: trains Solvers on curricula, and writes a folder of measurements."""
 
 from proposer_rl.experiment.loop import Experiment as Experiment
 from proposer_rl.experiment.loop import ScheduleSettings as ScheduleSettings

@@ -1,10 +1,10 @@
-"""Episodes that go on from update to update: each gets a level, and is credited to it.
+"""Assigns levels to episodes that go on from update to update, and credits results to levels.
 
-An update then trains on parts of episodes. Levels are proposed before it, as many as ended episodes
-in the last one and one more for each environment; those that are left over come first in the next
-update, the oldest being given up where there are too many. Where all are used up a level is played
-again. What came of a level is known when its episode is over, an update or many later: the batch is
-observed in parts, as soon as it is known which of its levels are played.
+An update trains on parts of episodes. Before it, the curriculum proposes as many levels as episodes
+ended in the last update, and one more for each environment. Unused levels come first in the next
+update; the oldest are given up if there are too many. If all are used up, a level is played again.
+The result of a level is known when its episode ends, in this update or many updates later. So a
+batch is observed in parts, as soon as it is known which of its levels are played.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from proposer_rl.curricula.batches import device_of, moved, of_kind, packed
+from proposer_rl.curricula.batches import packed, unpacked
 from proposer_rl.curricula.contract import Batch, Curriculum, outcome_of_episodes, proposed
 from proposer_rl.curricula.ledger import Ledger
 from proposer_rl.curricula.student import Student
@@ -37,7 +37,7 @@ Credit = tuple[Batch, TensorDict]
 
 
 class Queue:
-    """The levels of one Solver whose episodes go on: those that wait, are played, or are over.
+    """The levels of one Solver whose episodes go on: waiting, being played, or over.
 
     Args:
         curriculum: that proposes.
@@ -88,7 +88,7 @@ class Queue:
             self._over.clear()
 
     def cut(self, history: TensorDictBase, before: int, ends: Sequence[Sequence[int]]) -> None:
-        """Notes episodes that ended.
+        """Records the episodes that ended.
 
         Args:
             history: steps [P, H], of which the update's begin at ``before``.
@@ -110,14 +110,14 @@ class Queue:
         self.steps = history.shape[1] - begun
 
     def credits(self) -> list[Credit]:
-        """Returns what is to be observed now."""
+        """Returns the batches, or parts of them, that are to be observed now."""
         return [
             (batch, outcome_of_episodes(results["episode"].tolist()))
             for batch, results in self._ledger.take(settled=True)
         ]
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all of it."""
+        """Returns the whole queue."""
         return {
             "at": self._at,
             "levels": packed(self.levels),
@@ -128,15 +128,15 @@ class Queue:
         }
 
     def load_state_dict(self, state: Mapping[str, Any], device: torch.device | None) -> None:
-        """Puts back what :meth:`state_dict` returned; episodes go to a device."""
+        """Restores what :meth:`state_dict` returned, with episodes on this device."""
         self._at, self._most = state["at"], state["most"]
-        self.levels = _of_kind(self.levels, state["levels"])
+        self.levels = unpacked(state["levels"], self.levels)
         self._playing, self.steps = list(state["playing"]), state["steps"].clone()
         self._ledger.load_state_dict(state["ledger"], self.levels, device)
 
 
 class ContinuedLevels:
-    """Trains K Solvers side by side whose episodes go on, each on levels of its own curriculum.
+    """Trains K Solvers whose episodes go on, each on the levels of its own curriculum.
 
     Args:
         curricula: that propose.
@@ -165,7 +165,7 @@ class ContinuedLevels:
         self._shown: list[Played | None] = [None] * len(self._queues)
 
     def update(self, rngs: Sequence[Streams]) -> tuple[Update, list[list[Credit]]]:
-        """Makes one update, whose actions and levels are drawn from K streams of its own.
+        """Makes one update, with actions and levels from K streams.
 
         Returns:
             The update, and what each curriculum is to observe now.
@@ -183,7 +183,7 @@ class ContinuedLevels:
         return update, credits
 
     def _next_levels(self, begins: Tensor) -> Levels:
-        """Returns the levels [K, P] that are played from now on, new ones where episodes begin.
+        """Returns the levels [K, P] to play from now on, new ones where episodes begin.
 
         Args:
             begins: where they do, bool [K, P].
@@ -195,7 +195,7 @@ class ContinuedLevels:
         return torch.stack([queue.levels for queue in self._queues])
 
     def _cut(self, rollout: TensorDictBase) -> None:
-        """Notes the episodes that ended in a rollout [K, P, T], and keeps what has not ended."""
+        """Records the episodes that ended in a rollout [K, P, T], and keeps unfinished ones."""
         kept = rollout.exclude("advantage", "value_target")
         if not self._keeps_seen:
             seen = self._learner.agent.step_keys
@@ -211,7 +211,7 @@ class ContinuedLevels:
 
     @property
     def shown(self) -> list[Played]:
-        """Returns for each Solver the levels that were observed last, and the episodes on them.
+        """Each Solver's last observed levels, with the episodes on them.
 
         Before anything was observed these are the levels that are played, without a step (T = 0).
         """
@@ -220,7 +220,7 @@ class ContinuedLevels:
         return [shown or (queue.levels, own[:, :0]) for shown, queue, own in each]
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that a resumed run needs, with the actions of episodes that are not over."""
+        """Returns all that a resumed run needs, with the actions of unfinished episodes."""
         memory = self._learner.collector.memory
         discounted = self._learner.statistics.discounted
         return {
@@ -232,7 +232,7 @@ class ContinuedLevels:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back a state, and plays episodes that are not over again up to where they were.
+        """Restores a state, and replays unfinished episodes up to where they were.
 
         Tensors of a checkpoint are on the CPU; those that meet the learner's go to its device.
         """
@@ -245,7 +245,7 @@ class ContinuedLevels:
             if shown is not None:
                 levels, episodes = shown
                 self._shown[k] = (
-                    _of_kind(self._queues[k].levels, levels),
+                    unpacked(levels, self._queues[k].levels),
                     TensorDict.from_dict(episodes, batch_dims=2).to(device),
                 )
         if state["history"] is not None:
@@ -258,8 +258,3 @@ class ContinuedLevels:
         if state["memory"] is not None:
             memory = TensorDict.from_dict(state["memory"], batch_dims=2)
             self._learner.collector.memory = memory.to(device)
-
-
-def _of_kind(like: Levels, state: Mapping[str, Any]) -> Levels:
-    """Returns levels of the class and on the device of others, from nested dicts."""
-    return moved(of_kind(like, state), device_of(like))

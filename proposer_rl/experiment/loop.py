@@ -1,4 +1,4 @@
-"""The outer loop: a Solver, a curriculum and a budget become a folder of measurements."""
+"""The outer loop: trains Solvers on curricula, and writes a folder of measurements."""
 
 from __future__ import annotations
 
@@ -14,9 +14,18 @@ from annotated_types import Ge, Gt
 from tensordict import TensorDict
 from tqdm import tqdm
 
-from proposer_rl.curricula import Curriculum, LearnedCurriculum, outcome_of
-from proposer_rl.experiment.continued import ContinuedLevels
-from proposer_rl.experiment.side_by_side import SideBySide
+from proposer_rl.curricula import (
+    Batch,
+    Curriculum,
+    LearnedCurriculum,
+    TaskStudent,
+    outcome_of,
+    require,
+)
+from proposer_rl.curricula.batches import saved
+from proposer_rl.curricula.bins import along_axes
+from proposer_rl.curricula.contract import proposed
+from proposer_rl.experiment.continued import ContinuedLevels, Credit
 from proposer_rl.experiment.tables import Log, RunTables
 from proposer_rl.learning import PPO, located
 from proposer_rl.runs.checkpoint import CheckpointError, State, load_latest, save_checkpoint
@@ -24,11 +33,12 @@ from proposer_rl.runs.folder import SLACK, RunFolder, can_reach, read_csv
 from proposer_rl.runs.process import Output, Status, StopRequested, StopSignals
 from proposer_rl.settings import ArgumentError, settings
 from proposer_rl.streams import Streams
-from proposer_rl.task import Task
+from proposer_rl.task import NoSuccessError, Task, nearest_bins
+from proposer_rl.task.protocols import MANY_BINS
 
 
 class Experiment:
-    """The loop over cycles of improving the curriculum and training the Solver on it.
+    """Runs an experiment: improves the curricula in cycles, and trains Solvers on their levels.
 
     Args:
         task: which measures and records.
@@ -88,7 +98,7 @@ class Experiment:
 
     @property
     def seconds(self) -> float:
-        """Wall time of the run, that of its interrupted parts included up to their checkpoints."""
+        """Wall time of the run, including interrupted parts up to their checkpoints."""
         return self._seconds_before + time.monotonic() - self._started
 
     @property
@@ -110,7 +120,7 @@ class Experiment:
         ]
 
     def run(self) -> dict[str, Any]:
-        """Trains to the end of the schedule, from the folder's newest checkpoint if it has one.
+        """Trains to the end of the schedule, from the folder's newest checkpoint if there is one.
 
         Returns:
             The summary of the run, ready for JSON.
@@ -157,7 +167,7 @@ class Experiment:
         return self.summary()
 
     def summary(self) -> dict[str, Any]:
-        """Returns sample efficiency and cost so far, from the metrics in the folder."""
+        """Computes sample efficiency and cost so far from the metrics in the folder."""
         rows = read_csv(self.folder.path / "metrics.csv")
         headline, threshold = self.schedule.headline, self.schedule.threshold
         reached = {
@@ -206,13 +216,20 @@ class Experiment:
                 self._restore(before)
 
     def _log_cycle(self, improved: Sequence[Mapping[str, Any]] | None = None) -> bool:
-        """Writes the logs of the cycle that has ended, and metrics of its improvement."""
+        """Writes the logs of the cycle that has ended, and metrics of its improvement.
+
+        Each has the histogram of the levels trained on, unless the curriculum logs its own.
+
+        Returns:
+            Whether a curriculum logged something or was improved.
+        """
         logs = [curriculum.log() for curriculum in self.sides.curricula]
         metrics = [
             {**log, **own} for log, own in zip(logs, improved or [{}] * len(logs), strict=True)
         ]
-        if any(metrics):
-            self._tables.add_cycle(self.updates, self.cycles, metrics, self.costs)
+        rows = self.sides.with_histograms(metrics)
+        if any(rows):
+            self._tables.add_cycle(self.updates, self.cycles, rows, self.costs)
         return any(metrics)
 
     def _update(self) -> None:
@@ -258,7 +275,7 @@ class Experiment:
         return f"{self.schedule.headline} {mean:.3f}"
 
     def _pause(self, due: bool) -> None:
-        """Saves if it is due or a signal came, and then acts on the signal."""
+        """Saves if a checkpoint is due or a signal came, and then obeys the signal."""
         limit = self.schedule.checkpoint_seconds
         late = limit is not None and time.monotonic() - self._saved >= limit
         if due or late or self._signals.pending:
@@ -316,9 +333,95 @@ class Experiment:
         self._headline = [float(value) for value in state["headline"]]
 
 
+class SideBySide:
+    """K curricula, each with its view of one of the K Solvers that train side by side.
+
+    Args:
+        task: of the students.
+        learner: of K Solvers.
+        curricula: one for each of them.
+
+    Raises:
+        UnfitStudentError: if the task does not allow what a curriculum needs.
+        NoSuccessError: if a curriculum reads success and the task has none.
+    """
+
+    def __init__(self, task: Task, learner: PPO, curricula: Sequence[Curriculum]) -> None:
+        self.curricula = list(curricula)
+        self.students = [TaskStudent(task, learner, k) for k in range(len(curricula))]
+        self._space = task.space
+        known = hasattr(task.space, "locate") and bool(task.space.axes)
+        none_yet = torch.zeros(task.space.size, dtype=torch.int64)
+        counted = known and task.space.size <= MANY_BINS
+        # Levels of each bin, int64 [N]; None where the curriculum itself tells of them.
+        self._counts = [none_yet.clone() if counted else None for _ in curricula]
+        for student, curriculum in zip(self.students, self.curricula, strict=True):
+            require(student, curriculum.needs, type(curriculum).__name__)
+            if "success" in curriculum.required_results and "success" not in task.results:
+                raise NoSuccessError(
+                    f"{type(curriculum).__name__}: reads success of episodes, and this task tells "
+                    "none, only the return"
+                )
+
+    def propose(self, count: int, rngs: Sequence[Streams]) -> list[Batch]:
+        """Lets each curriculum propose ``count`` levels from its own streams."""
+        each = zip(self.curricula, self.students, rngs, strict=True)
+        return [proposed(curriculum, student, count, rng) for curriculum, student, rng in each]
+
+    def observe(self, credits: Sequence[Sequence[Credit]]) -> None:
+        """Lets each curriculum observe its batches, or parts of them."""
+        each = zip(self.curricula, self.students, credits, self._counts, strict=True)
+        for curriculum, student, own, counts in each:
+            for batch, outcome in own:
+                curriculum.observe(student, batch, outcome)
+                if counts is not None:
+                    bins = nearest_bins(self._space, self._space.locate(batch.levels))
+                    counts += bins.bincount(minlength=len(counts))
+
+    def with_histograms(self, logs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Adds to each curriculum's log how many levels it has observed near each bin since then.
+
+        That is ``histogram`` along the axes of the task's space, unless the curriculum logs its
+        own, or there are no bins to tell levels by, or too many of them.
+        """
+        rows = []
+        for k, log in enumerate(logs):
+            if "histogram" in log:
+                self._counts[k] = None
+            counts = self._counts[k]
+            if counts is not None and counts.any():
+                log = {"histogram": along_axes(counts, self._space), **log}
+                self._counts[k] = torch.zeros_like(counts)
+            rows.append(log)
+        return rows
+
+    def improve(self, rngs: Sequence[Streams]) -> list[dict[str, Any]]:
+        """Improves the curricula that learn, and returns the metrics of each."""
+        return [
+            curriculum.improve(student, rng) if isinstance(curriculum, LearnedCurriculum) else {}
+            for curriculum, student, rng in zip(self.curricula, self.students, rngs, strict=True)
+        ]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the states of the curricula, the counters of their students, and histograms."""
+        return {
+            "counts": saved(self._counts),
+            "curricula": [curriculum.state_dict() for curriculum in self.curricula],
+            "asked": [[student.frames, student.evaluations] for student in self.students],
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        self._counts = saved(state["counts"])
+        for curriculum, own in zip(self.curricula, state["curricula"], strict=True):
+            curriculum.load_state_dict(own)
+        for student, (frames, evaluations) in zip(self.students, state["asked"], strict=True):
+            student.frames, student.evaluations = frames, evaluations
+
+
 @settings
 class ScheduleSettings:
-    """Settings of a run's length and of what happens how often, in Solver updates.
+    """Settings of the length of a run and of its intervals, in Solver updates.
 
     Attributes:
         updates: length of the run.
@@ -343,7 +446,7 @@ class ScheduleSettings:
 
 
 def check_headline(task: Task, schedule: ScheduleSettings) -> None:
-    """Refuses a headline that is not measured, and a threshold that it cannot reach.
+    """Refuses a headline that is not measured, or a threshold that it cannot reach.
 
     Raises:
         ArgumentError: if the headline is none of the task's metrics, or a rate that is to reach

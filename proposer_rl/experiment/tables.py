@@ -1,4 +1,4 @@
-"""The tables that an experiment writes into its folder, and their rows for a logger."""
+"""Writes the tables of an experiment into its folder, and passes rows to a logger."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LOGGED = ("metrics.csv", "training.csv", "cycles.jsonl")  # of numbers
 
 
 class RunTables:
-    """The tables of K Solvers that are trained side by side."""
+    """Writes the tables of K Solvers that train side by side."""
 
     def __init__(
         self, task: Task, seeds: Sequence[int], folder: RunFolder, log: Log | None
@@ -49,7 +49,7 @@ class RunTables:
         played: Sequence[tuple[Levels, TensorDictBase]],
         metrics: TensorDictBase,
     ) -> None:
-        """Writes each Solver's numbers of an update, and a sample of its levels.
+        """Writes each Solver's metrics of an update, and a sample of its levels.
 
         Args:
             updates: so far.
@@ -75,7 +75,7 @@ class RunTables:
         logs: Sequence[Mapping[str, Any]],
         costs: Sequence[Mapping[str, float]],
     ) -> None:
-        """Writes each curriculum's log of the cycle that has ended, with its levels recorded."""
+        """Writes each curriculum's log of the last cycle, with the levels in it recorded."""
         for seed, log, spent in zip(self._seeds, logs, costs, strict=True):
             told = dict(log)
             if "levels" in told:
@@ -88,7 +88,7 @@ class RunTables:
             self._append("cycles.jsonl", {**place, **asked, **told})
 
     def log_again(self, updates: int) -> None:
-        """Logs again the rows of the update that a run goes on from.
+        """Logs again the rows of the update from which a resumed run goes on.
 
         A logger then drops what it has from this update on.
 

@@ -1,4 +1,4 @@
-"""PPO of one agent, or of K replicas of it at once."""
+"""PPO for one agent, or for K independent replicas of it at once."""
 
 from proposer_rl.learning.episodes import first_episode_return as first_episode_return
 from proposer_rl.learning.episodes import first_episode_success as first_episode_success

@@ -1,4 +1,4 @@
-"""Measures whole episodes: those of a rollout, and those played on levels."""
+"""Plays and measures whole episodes."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def play_episodes(
         else:
             given = noise[step, place]
             action = draw_at(distribution, given.expand(len(over), *given.shape))
-        after = env.step(state.set(agent.action_key, action))["next"]
+        after = env.step(state.set("action", action))["next"]
         yield place, after, ~over
         over = over | after["done"].squeeze(-1)
         state = after.exclude("reward")
@@ -80,7 +80,7 @@ def mean_performance(
     at_once: int | None = None,
     drop_finished: bool = False,
 ) -> TensorDict:
-    """Returns mean return and share of successes of K Solvers over episodes on levels.
+    """Plays episodes of K Solvers on levels; returns mean returns and shares of successes.
 
     The random numbers are those of the levels, the same for every Solver: they differ by what they
     do alone, and what one gets does not depend on which others are evaluated with it.
@@ -117,7 +117,7 @@ def mean_performance(
                 int(torch.randint(SEEDS, (), generator=generator))
             )
         env = make_env(some)
-        device, shape = env.device, env.full_action_spec[agent.action_key].shape[1:]
+        device, shape = env.device, env.full_action_spec["action"].shape[1:]
         noise = None if greedy else torch.rand(max_steps, *shape, generator=draws).to(device)
         returns, success = torch.zeros(2, *some.batch_size, device=device)
         remake = (lambda place, some=some: make_env(some[:, place])) if drop_finished else None
@@ -131,7 +131,7 @@ def mean_performance(
 
 
 def first_episode_return(rollout: TensorDictBase) -> Tensor:
-    """Returns every environment's sum of rewards in its first episode, as far as it was played.
+    """Returns the sum of rewards in every environment's first episode.
 
     Args:
         rollout: batch [*B, T] with ``("next", "done")`` and ``("next", "reward")`` [*B, T, 1].
@@ -160,7 +160,7 @@ def succeeded(rollout: TensorDictBase) -> Tensor:
 
 
 def first_episode_success(rollout: TensorDictBase) -> Tensor:
-    """Returns whether every environment's first episode succeeded; not if the rollout cut it off.
+    """Returns whether every environment's first episode ended in success within the rollout.
 
     Args:
         rollout: batch [*B, T] with ``("next", "done")`` [*B, T, 1], and what :func:`succeeded`
@@ -182,6 +182,6 @@ def first_episode_success(rollout: TensorDictBase) -> Tensor:
 
 
 def in_first_episode(rollout: TensorDictBase) -> Tensor:
-    """Returns whether each step is at or before the first end of an episode, bool [*B, T]."""
+    """Returns whether each step belongs to the first episode, bool [*B, T]."""
     done = rollout["next", "done"].squeeze(-1).long()
     return done.cumsum(-1) - done == 0

@@ -1,4 +1,4 @@
-"""Functions of tensordicts as CUDA graphs, by tensordict's ``CudaGraphModule``.
+"""Replays functions of tensordicts as CUDA graphs, with tensordict's ``CudaGraphModule``.
 
 Thousands of small kernels cost a GPU less time than it takes Python to ask for them one by one; a
 graph asks for all of them at once. It repeats kernels on the memory that they were recorded with
@@ -28,18 +28,18 @@ WARM_UPS = 2  # calls of the function itself, in the last of which it is recorde
 
 
 class GraphError(ArgumentError):
-    """A function cannot be recorded; the message is one line."""
+    """A function cannot be recorded as a CUDA graph; the message is one line."""
 
     exit_code = 2
 
 
 def has_graphs(device: torch.device) -> bool:
-    """Returns whether functions on a device can be replayed."""
+    """Returns whether a device can replay functions."""
     return device.type == "cuda"
 
 
 def replayed(function: Callable[..., TensorDictBase]) -> Callable[..., TensorDictBase]:
-    """Returns a function that a GPU replays from its third call on, with the same results.
+    """Wraps a function so that a GPU replays it from the third call on, with the same results.
 
     Args:
         function: from a tensordict, and further objects, which are the same in every call, to a
@@ -75,7 +75,7 @@ def replayed(function: Callable[..., TensorDictBase]) -> Callable[..., TensorDic
 
 @contextmanager
 def _no_garbage() -> Iterator[None]:
-    """Switches garbage collection off: another graph that is collected would spoil a recording."""
+    """Pauses garbage collection: collecting another graph would spoil a recording."""
     gc.collect()
     enabled = gc.isenabled()
     gc.disable()
@@ -87,7 +87,7 @@ def _no_garbage() -> Iterator[None]:
 
 
 class ReplayedOfAgents:
-    """A function of agents and tensordicts, recorded for each agent and each size of its inputs.
+    """Records a function of an agent and levels once for each agent and each size.
 
     Args:
         function: of an agent, of levels where there are any, and of what has no say in the result,
@@ -99,7 +99,7 @@ class ReplayedOfAgents:
         self._graphs: WeakKeyDictionary[Any, dict[Any, Any]] = WeakKeyDictionary()
 
     def __call__(self, agent: Any, *given: Any) -> Any:
-        """Calls the function, or replays what was recorded for this agent and these sizes."""
+        """Calls the function, or replays the recording for this agent and these sizes."""
         inputs = TensorDict({"levels": given[0]} if given else {})
         size = tuple(entry.shape for entry in tree_leaves(inputs.to_dict()))
         graphs = self._graphs.setdefault(agent, {})

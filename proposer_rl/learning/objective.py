@@ -1,4 +1,4 @@
-"""PPO for K replicas at once: its settings, advantages, the clipped loss, gradients.
+"""PPO's settings, advantages, loss and gradients for K replicas at once.
 
 All of it is TorchRL's, without what would mix replicas or wait for a device; what is reported of a
 step is of each replica by itself, and refused where it is not finite. A rule that joins several
@@ -29,7 +29,7 @@ LEAST_DISCOUNT = 1e-7  # below it, float32 does not know the next reward from no
 
 @settings
 class LearningSettings:
-    """PPO's numbers but for the horizon; the defaults are the paper's for the Solver.
+    """PPO's numbers except the horizon; the defaults are the paper's for the Solver.
 
     Attributes:
         updates: updates on one batch; each computes advantages anew, then runs ``epochs``.
@@ -100,16 +100,14 @@ class SolverSettings:
     ppo: PPOSettings = PPOSettings()
 
 
-def gae(gamma: float, lmbda: float, value_key: str) -> GAE:
-    """Returns TorchRL's generalised advantage estimation, of values that stand in the rollout."""
+def gae(gamma: float, lmbda: float) -> GAE:
+    """Makes TorchRL's generalised advantage estimation for rollouts that contain values."""
     # Its vectorised form splits the batch where episodes end, which it has to look up.
-    estimator = GAE(gamma=gamma, lmbda=lmbda, value_network=None, vectorized=False)
-    estimator.set_keys(value=value_key)
-    return estimator
+    return GAE(gamma=gamma, lmbda=lmbda, value_network=None, vectorized=False)
 
 
 class LeaveOneOutBaseline(TensorDictModuleBase):
-    """The return to come, minus what the other replicas had to come at the same step.
+    """Computes advantages as returns minus the mean return of the other replicas.
 
     Where all K episodes start from one state, the others' mean return is an unbiased estimate of
     that state's value, and a far better one than a critic that has seen a few episodes
@@ -158,7 +156,7 @@ MakeLoss = Callable[[TensorDictModuleBase, TensorDictModule], LossModule]
 
 
 def make_loss(make: MakeLoss, agent: ActorCritic) -> LossModule:
-    """Returns the loss of an agent's actor and critic, which reads what the agent writes.
+    """Makes the loss of an agent's actor and critic from the entries that the agent writes.
 
     Raises:
         ValueError: if it reduces what belongs to different replicas.
@@ -166,14 +164,11 @@ def make_loss(make: MakeLoss, agent: ActorCritic) -> LossModule:
     loss = make(*agent.readout())
     if loss.reduction != "none":
         raise ValueError(f'reduction of the loss must be "none", got {loss.reduction!r}')
-    loss.set_keys(
-        action=agent.action_key, sample_log_prob=agent.log_prob_key, value=agent.value_key
-    )
     return loss.to(next(agent.parameters()).device)
 
 
 class CopiesClipLoss(ClipPPOLoss):
-    """The clipped loss of every transition, with advantages standardised over each replica's batch.
+    """PPO's clipped loss of every transition, with advantages standardised for each replica.
 
     ``entropy``, ``kl_approx`` and ``clip_fraction`` are of every transition, too, where TorchRL's
     are means over all replicas.
@@ -218,7 +213,7 @@ class CopiesClipLoss(ClipPPOLoss):
         return log_weight, distribution, kl_approx, correction
 
     def loss_critic(self, tensordict: TensorDictBase) -> tuple[Any, ...]:
-        """Returns the critic's term; its old values are those with which the agent acted."""
+        """Returns the critic's term, relative to the values at the time of acting."""
         self._acted_value = tensordict.get(ACTED_VALUE, None)
         return super().loss_critic(tensordict)
 
@@ -238,15 +233,15 @@ class CopiesClipLoss(ClipPPOLoss):
 
 
 def of_copies(numbers: Tensor, copies: int | None) -> Tensor:
-    """Returns means over each replica's batch, [K] or []; a scalar stands for all replicas."""
+    """Averages over each replica's batch, [K] or []; a scalar stands for all replicas."""
     if copies is not None and not numbers.ndim:
         return numbers.expand(copies)
     return numbers.flatten(0 if copies is None else 1).mean(-1)
 
 
-def explained_variance(steps: TensorDictBase, value_key: str, copies: int | None) -> Tensor:
+def explained_variance(steps: TensorDictBase, copies: int | None) -> Tensor:
     """Returns the share of the targets' variance that the values explain, [K] or []."""
-    value, target = steps[value_key].detach(), steps["value_target"]
+    value, target = steps["state_value"].detach(), steps["value_target"]
     batch = 0 if copies is None else 1
     residual, total = (x.flatten(batch).var(-1, correction=0) for x in (target - value, target))
     return 1 - residual / total.clamp_min(1e-12)
@@ -284,7 +279,7 @@ def require_finite(
     copies: int | None,
     first: int = 0,
 ) -> None:
-    """Checks one update; costs one number read from the device unless something is wrong.
+    """Checks that an update is finite; reads one number from the device if all is well.
 
     Args:
         reward: of the rollout, [B, ...], B the first dimension of the environment.
@@ -315,7 +310,7 @@ def require_finite(
 
 @contextmanager
 def located(place: str) -> Iterator[None]:
-    """Says in a :class:`DivergedError` from inside where in the run that was."""
+    """Adds to a :class:`DivergedError` raised inside where in the run it happened."""
     try:
         yield
     except DivergedError as error:

@@ -1,4 +1,4 @@
-"""Proximal policy optimisation of one agent, or of K independent replicas of it at once.
+"""Proximal policy optimisation (PPO) of one agent, or of K independent replicas at once.
 
 An update, from top to bottom: act for T steps, estimate advantages A, then make S gradient steps,
 on all of it or on shuffled parts of it, on
@@ -30,6 +30,7 @@ from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_
 from proposer_rl.learning.training_batch import Minibatches, Statistics
 from proposer_rl.models import ActorCritic, Population, one_copy
 
+VALUES = ("state_value", ("next", "state_value"))
 DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # beside the terms, where a loss has them
 
 
@@ -41,7 +42,7 @@ class Update(NamedTuple):
 
 
 class PPO:
-    """An agent, the environment it acts in, and its optimiser.
+    """Trains an agent by PPO in an environment.
 
     Args:
         env: batch [*B]; with replicas, B = [K, ...]. Entries that the agent's encoder reads must
@@ -89,9 +90,7 @@ class PPO:
         )
         self._minibatches = Minibatches(agent, env.batch_size, settings)
         self.statistics = Statistics(env, agent, settings)
-        self._advantage = advantage or objective.gae(
-            settings.gamma, settings.lmbda, agent.value_key
-        )
+        self._advantage = advantage or objective.gae(settings.gamma, settings.lmbda)
         clipped = partial(
             objective.CopiesClipLoss,
             copies=agent.copies,
@@ -108,21 +107,21 @@ class PPO:
 
     @property
     def copies(self) -> int | None:
-        """Returns the number K of replicas; None without."""
+        """The number K of replicas; None without."""
         return self.agent.copies
 
     @property
     def horizon(self) -> int:
-        """Returns the steps T of a rollout."""
+        """The number T of steps of a rollout."""
         return self.settings.horizon
 
     def update(self, generators: list[torch.Generator] | None = None) -> Update:
-        """Collects one batch and trains on it; see :meth:`collect` and :meth:`optimise`."""
+        """Collects a batch and trains on it; see :meth:`collect` and :meth:`optimise`."""
         rollout = self.collect(generators)
         return Update(rollout, self.optimise(rollout, generators))
 
     def collect(self, generators: list[torch.Generator] | None = None) -> TensorDictBase:
-        """Resets the environment, unless its episodes go on, and acts for a horizon.
+        """Acts for one horizon, from a reset unless episodes go on.
 
         Args:
             generators: one for each index of the environment's first dimension, from which its
@@ -136,7 +135,7 @@ class PPO:
 
     @property
     def left(self) -> float:
-        """Returns the factor, 0 to 1, by which annealing scales the next update's learning rate."""
+        """The factor from 1 to 0 by which annealing scales the next learning rate."""
         settings = self.settings
         if settings.anneal_updates is None:
             return 1.0
@@ -145,13 +144,13 @@ class PPO:
 
     @property
     def learning_rate(self) -> float:
-        """Returns the learning rate of the next update."""
+        """The learning rate of the next update."""
         return self.settings.learning_rate * self.left
 
     def optimise(
         self, rollout: TensorDictBase, generators: list[torch.Generator] | None = None
     ) -> TensorDict:
-        """Trains on a rollout of the present policy, [*B, T] as :meth:`collect` returns it.
+        """Trains on a rollout of the current policy, [*B, T] as :meth:`collect` returns it.
 
         Writes ``advantage`` and ``value_target`` into the rollout.
 
@@ -187,19 +186,19 @@ class PPO:
             ``gradient_steps`` [S] or [S, K], the metrics of each; and of the ``steps`` what is
             computed here: values, advantages and targets.
         """
-        steps, level, value = batch["steps"].copy(), batch["level"], self.agent.value_key
+        steps, level = batch["steps"].copy(), batch["level"]
         taken = []
         for update in range(self.settings.updates):
             if update:
                 set_values(self.agent, steps, level)
             self._advantage(steps)
             if self.settings.clip_value is not None:
-                steps.set(objective.ACTED_VALUE, steps[value])
+                steps.set(objective.ACTED_VALUE, steps["state_value"])
             for epoch in range(self.settings.epochs):
                 order = batch.get(f"order_{update}_{epoch}", None)
                 parts = self._minibatches(steps, level, order)
                 taken += [self._gradient_step(*part) for part in parts]
-        computed = steps.select(value, ("next", value), "advantage", "value_target")
+        computed = steps.select(*VALUES, "advantage", "value_target")
         return TensorDict({"steps": computed, "gradient_steps": TensorDict.stack(taken)})
 
     def _gradient_step(self, steps: TensorDictBase, level: TensorDictBase) -> TensorDict:
@@ -224,18 +223,18 @@ class PPO:
             if key.startswith("loss_") or key in DIAGNOSTICS
         }
         terms = [metric for key, metric in metrics.items() if key.startswith("loss_")]
-        metrics["explained_variance"] = objective.explained_variance(steps, agent.value_key, copies)
+        metrics["explained_variance"] = objective.explained_variance(steps, copies)
         return torch.stack(terms).sum(), {key: metric.detach() for key, metric in metrics.items()}
 
     def complete(self, rollout: TensorDictBase) -> TensorDictBase:
-        """Adds what :meth:`optimise` needs to a rollout [*B, T] that another process has made."""
+        """Adds the values that :meth:`optimise` needs to a rollout [*B, T] of another process."""
         with torch.no_grad():
             context = self.agent.encode(rollout.select(*self.agent.level_keys)[..., 0])
         set_next_values(self.agent, rollout, context)
         return rollout
 
     def compile(self) -> PPO:
-        """Lets torch.compile fuse what a gradient step computes from here on, for a GPU.
+        """Compiles the computation of gradient steps with torch.compile, for a GPU.
 
         The first step takes half a minute and more, and numbers are rounded otherwise.
 
@@ -251,7 +250,7 @@ class PPO:
         return self
 
     def replay(self, *, rollouts: bool) -> PPO:
-        """Replays training on a GPU as a CUDA graph from here on, which changes no number.
+        """Replays training on a GPU as a CUDA graph from now on, with the same numbers.
 
         Args:
             rollouts: whether acting is replayed, too. The environment then reads nothing back from
@@ -266,7 +265,7 @@ class PPO:
         return self
 
     def check(self, first: int = 0) -> None:
-        """Checks that the last update was finite; this waits for the device, training does not.
+        """Checks that the last update was finite, which waits for the device.
 
         Args:
             first: number of the first replica, by which replicas are named.
@@ -278,20 +277,21 @@ class PPO:
         objective.require_finite(*self._last_training, weights, self.agent.copies, first)
 
     def replica(self, number: int) -> Replica:
-        """Returns one of K replicas by itself; it changes as this learner trains."""
+        """Returns a view of one of K replicas, which changes as this learner trains."""
         return Replica(self, number)
 
     def snapshot(self) -> TensorDict:
-        """Returns a copy of weights and Adam's state, batch [K] with replicas and [] without.
+        """Copies weights and Adam's state: batch [K] with replicas, [] without.
 
         ``snapshot[k]`` is replica ``k``; ``snapshot[[k] * 16]`` is 16 replicas of it.
         """
         return take_snapshot(self.agent, self._adam)
 
     def restore(self, snapshot: TensorDictBase) -> None:
-        """Restores a snapshot of as many replicas; a ValueError says why one does not fit.
+        """Restores a snapshot with the same number of replicas; all episodes begin anew.
 
-        Episodes that would have gone on begin anew.
+        Raises:
+            ValueError: if the snapshot does not fit.
         """
         self.collector.begin_anew()
         self.statistics.discounted = None
@@ -299,7 +299,7 @@ class PPO:
 
 
 class Replica:
-    """One of the K replicas that train side by side, to be evaluated as if it were alone.
+    """A view of one of K replicas, to be evaluated as if it were alone.
 
     Its agent lies in the memory of theirs.
 
@@ -313,12 +313,12 @@ class Replica:
         self._learner, self._number = learner, number
 
     def snapshot(self) -> TensorDict:
-        """Returns a copy of its weights and Adam's state, batch [1]."""
+        """Copies its weights and Adam's state, batch [1]."""
         return self._learner.snapshot()[self._number : self._number + 1]
 
 
 def complete_adam(parameters: Sequence[nn.Parameter], learning_rate: float, eps: float) -> Adam:
-    """Returns torch's Adam with its state, which it otherwise makes at its first step.
+    """Makes Adam with its state, which torch would make at the first step.
 
     On a GPU its learning rate is a tensor there, so that a graph of its steps reads what it is set
     to (:func:`set_learning_rate`).
@@ -347,7 +347,7 @@ def set_learning_rate(adam: Adam, learning_rate: float) -> None:
 
 
 def take_snapshot(agent: ActorCritic, adam: Adam) -> TensorDict:
-    """Returns a copy of weights and Adam's state, batch [K] with replicas and [] without."""
+    """Copies weights and Adam's state: batch [K] with replicas, [] without."""
     batch = _batch(agent)
     entries: dict[str, TensorDict] = {}
     for name, value in agent_values(agent).items():
@@ -361,7 +361,7 @@ def take_snapshot(agent: ActorCritic, adam: Adam) -> TensorDict:
 
 
 def restore_snapshot(agent: ActorCritic, adam: Adam, snapshot: TensorDictBase) -> int:
-    """Restores a snapshot of as many replicas (in place).
+    """Restores a snapshot with the same number of replicas (in place).
 
     Returns:
         The number of Adam's steps so far.
@@ -388,14 +388,14 @@ def _batch(agent: ActorCritic) -> torch.Size:
 
 
 def agent_values(agent: ActorCritic) -> dict[str, Tensor]:
-    """Returns an agent's weights, and moments of its observations and rewards, by name."""
+    """Returns an agent's weights and the moments of its observations and rewards, by name."""
     learnt = agent.normalization
     moments = () if learnt is None else learnt.named_buffers("normalization")
     return dict([*agent.named_parameters(), *moments])
 
 
 def agent_weights(agent: ActorCritic) -> TensorDict:
-    """Returns a copy of an agent's weights and moments, batch [], for :func:`load_agent`."""
+    """Copies an agent's weights and moments, batch [], for :func:`load_agent`."""
     values = agent_values(agent)
     return TensorDict({name: {"value": value.detach().clone()} for name, value in values.items()})
 

@@ -1,4 +1,4 @@
-"""Rollouts of an agent by TorchRL's collector, in which a level is read once for all steps.
+"""Collects rollouts with TorchRL's collector, and reads each level once for all steps.
 
 Every rollout begins with a reset, or goes on with the episodes of the one before.
 """
@@ -21,7 +21,7 @@ from proposer_rl.settings import ArgumentError
 
 
 class RolloutCollector:
-    """A TorchRL collector that begins every rollout with a reset, or goes on with its episodes.
+    """Collects rollouts that begin with a reset, or go on with the episodes of the last one.
 
     Args:
         env: batch [*B]. What the agent's encoder reads must stay the same until its next reset.
@@ -48,7 +48,7 @@ class RolloutCollector:
         self.episodes = ContinuedEpisodes(env) if continued else None
         self.memory: TensorDictBase | None = None
         self._agent = agent
-        self._action = env.full_action_spec[agent.action_key]
+        self._action = env.full_action_spec["action"]
         self._horizon = horizon
         self._level = _LevelAside(*agent.level_keys) if agent.level_keys else None
         self._policy = RolloutPolicy(agent, self._level)
@@ -69,7 +69,7 @@ class RolloutCollector:
         self.begin_anew()  # a collector resets what it gets
 
     def begin_anew(self) -> None:
-        """Begins the next rollout with a reset in any case."""
+        """Makes the next rollout begin with a reset."""
         self.memory = None
         if self.episodes is not None:
             self.episodes.begin_anew()
@@ -87,7 +87,7 @@ class RolloutCollector:
 
     @torch.no_grad()
     def act(self, inputs: TensorDictBase) -> TensorDict:
-        """Acts by uniform ``noise`` [T, ...]: a ``rollout`` [*B, T] without its ``level`` [*B]."""
+        """Acts by uniform ``noise`` [T, ...]; returns ``rollout`` [*B, T] and ``level`` [*B]."""
         self._policy.begin(inputs["noise"], self.memory)
         rollout = self._collector.rollout()
         if self.episodes is not None:
@@ -100,7 +100,7 @@ class RolloutCollector:
 
 
 class ContinuedEpisodes(TransformedEnv):
-    """Hands out where its episodes stand when it is reset, after the first time.
+    """Lets episodes go on where a collector resets, after the first time.
 
     An episode begins where another has ended, on the level that is set by then. Levels can be set
     at any time, or they are asked of ``next_levels``.
@@ -120,15 +120,15 @@ class ContinuedEpisodes(TransformedEnv):
 
     @property
     def fresh(self) -> bool:
-        """Returns whether all episodes begin with the next reset."""
+        """Whether all episodes begin with the next reset."""
         return self._standing is None
 
     def begin_anew(self) -> None:
-        """Begins all episodes with the next reset."""
+        """Makes all episodes begin with the next reset."""
         self._standing: TensorDictBase | None = None
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Begins episodes where others have ended."""
+        """Begins new episodes where others have ended."""
         ended = tensordict["done"].squeeze(-1)
         if self.next_levels is not None and bool(ended.any()):
             self.base_env.set_levels(self.next_levels(ended))
@@ -137,7 +137,7 @@ class ContinuedEpisodes(TransformedEnv):
         return standing
 
     def stand(self, levels: Any, actions: Tensor, steps: Tensor) -> None:
-        """Brings episodes on levels [*B] to where others, with the same actions, were left.
+        """Replays actions until episodes on levels [*B] are where they were interrupted.
 
         An environment that does the same after the same actions then stands where that one did.
 
@@ -170,26 +170,25 @@ class ContinuedEpisodes(TransformedEnv):
 
 @torch.no_grad()
 def set_values(agent: ActorCritic, steps: TensorDictBase, level: TensorDictBase) -> None:
-    """Writes the present values of steps [*B, T] on a level [*B], before and after each step."""
+    """Writes the current values of steps [*B, T] on a level [*B], before and after each step."""
     context = agent.encode(level)
     with set_recurrent_mode(True):
         now = agent.decode(steps.select(*agent.step_keys), context)
-    for key in (agent.value_key, *agent.memory_keys):
+    for key in ("state_value", *agent.memory_keys):
         steps.set(key, now.get(key))
     set_next_values(agent, steps, context)
 
 
 @torch.no_grad()
 def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDictBase) -> None:
-    """Writes the values after each of the steps [*B, T], whose level has this context [*B].
+    """Writes the values after each of the steps [*B, T], given the context of their level [*B].
 
     The agent has the memory that is there after each step. Where an episode goes on, the value is
     that before the next step; an agent that reads each step by itself does not compute it again.
     """
-    after, key = steps.get("next").select(*agent.step_keys), agent.value_key
-    value = steps.get(key)
+    after, value = steps.get("next").select(*agent.step_keys), steps.get("state_value")
     if agent.level_keys or not population.at_hand(value):  # to count is to wait
-        steps.set(("next", key), agent.decode(after, context).get(key))
+        steps.set(("next", "state_value"), agent.decode(after, context).get("state_value"))
         return
     shape = (agent.copies or 1, -1)
     unknown = steps.get(("next", "done")).squeeze(-1).clone()
@@ -203,12 +202,12 @@ def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDi
     if agent.copies is None:
         asked = asked.squeeze(0)
     values = torch.cat([value[..., 1:, :], value[..., -1:, :]], -2).reshape(*unknown.shape, 1)
-    values[rows] = agent.decode(asked, context).get(key).reshape(*which.shape, 1)
-    steps.set(("next", key), values.view(value.shape))
+    values[rows] = agent.decode(asked, context).get("state_value").reshape(*which.shape, 1)
+    steps.set(("next", "state_value"), values.view(value.shape))
 
 
 class RolloutPolicy(TensorDictModuleBase):
-    """The collector's policy: reads steps off the context and draws actions from given noise.
+    """The policy of the collector: reads steps off the context and acts by given noise.
 
     It carries an agent's memory from step to step; the agent itself forgets where an episode ends.
     :meth:`begin` comes before every rollout.
@@ -226,16 +225,11 @@ class RolloutPolicy(TensorDictModuleBase):
         # In tuples, nn.Module does not register them.
         self._agent, self._level = (agent,), (level,)
         self.in_keys = agent.step_keys
-        self.out_keys = [
-            agent.action_key,
-            agent.log_prob_key,
-            agent.value_key,
-            *agent.memory,
-            *agent.memory_keys,
-        ]
+        written = ("action", "action_log_prob", "state_value")
+        self.out_keys = [*written, *agent.memory, *agent.memory_keys]
 
     def begin(self, noise: Tensor, memory: TensorDictBase | None = None) -> None:
-        """Prepares for the next rollout.
+        """Prepares the next rollout.
 
         Args:
             noise: uniform numbers in [0, 1), [T, ...], one for each element of T actions.
@@ -256,16 +250,16 @@ class RolloutPolicy(TensorDictModuleBase):
         step = agent.decode(tensordict.select(*agent.step_keys), self.context)
         distribution = agent.distribution(step)
         action = draw_at(distribution, noise)
-        tensordict.set(agent.action_key, action)
-        tensordict.set(agent.log_prob_key, distribution.log_prob(action))
+        tensordict.set("action", action)
+        tensordict.set("action_log_prob", distribution.log_prob(action))
         for before, after in zip(agent.memory, agent.memory_keys, strict=True):
             self.memory.set(before, step.get(after))
             tensordict.set(after, step.get(after))
-        return tensordict.set(agent.value_key, step.get(agent.value_key))
+        return tensordict.set("state_value", step.get("state_value"))
 
 
 class _LevelAside(ExcludeTransform):
-    """Puts entries aside that the collector would copy at every step, at each whole reset."""
+    """Keeps entries of the level from being copied at every step."""
 
     entries: TensorDictBase
 
@@ -277,7 +271,7 @@ class _LevelAside(ExcludeTransform):
 
 
 class _WithoutLevel(TransformedEnv):
-    """An environment without those entries, whose own way of resetting what is done is kept."""
+    """An environment without the entries of the level, which resets as the original does."""
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self.base_env.maybe_reset(tensordict).exclude(*self.transform.excluded_keys)

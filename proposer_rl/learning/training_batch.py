@@ -1,4 +1,4 @@
-"""Prepares an update: normalises a rollout and cuts it into shuffled minibatches."""
+"""Prepares updates: normalises rollouts and cuts them into shuffled minibatches."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from proposer_rl.settings import ArgumentError
 
 
 class Minibatches:
-    """Cuts rollouts into parts; what is shuffled are steps.
+    """Cuts rollouts into minibatches of shuffled steps or sequences.
 
     They are whole sequences where an agent has a memory, which goes through them, or an encoder,
     which reads a level once for all of its steps.
@@ -50,7 +50,7 @@ class Minibatches:
         self.steps = smallest * length if self._sequences else smallest
 
     def draw(self, generators: Sequence[torch.Generator] | None) -> dict[str, Tensor]:
-        """Draws an update's orders, one for each epoch by its entry's name: int64 [K, N] or [N].
+        """Draws the orders of an update's epochs by entry name: int64 [K, N] or [N].
 
         Replica k's come from the k-th generator; without any, from torch's default one.
         """
@@ -70,7 +70,7 @@ class Minibatches:
     def __call__(
         self, steps: TensorDictBase, level: TensorDictBase, order: Tensor | None
     ) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
-        """Yields the parts of steps [*B, T] in an epoch's order, each with its level.
+        """Yields the minibatches of steps [*B, T] in an epoch's order, each with its level.
 
         Without an order that is all of it as it is.
         """
@@ -81,8 +81,8 @@ class Minibatches:
         used = steps.select(
             *agent.step_keys,
             *agent.memory,
-            agent.action_key,
-            agent.log_prob_key,
+            "action",
+            "action_log_prob",
             "advantage",
             "value_target",
             ACTED_VALUE,
@@ -102,7 +102,7 @@ class Minibatches:
 
 
 class Statistics:
-    """Gives an agent its normalisation, and takes in what it trains on.
+    """Keeps the running moments by which an agent's observations and values are normalised.
 
     Observations that a rollout has are taken in after it has been trained on, so that training
     begins with the policy that acted; those of the very first one before, since until then there
@@ -141,40 +141,42 @@ class Statistics:
             agent.normalization = numbers.to(next(agent.parameters()).device)
 
     def before(self, rollout: TensorDictBase, level: TensorDictBase, *, first: bool) -> None:
-        """Updates the moments of rewards by a rollout [*B, T], and puts its values into their unit.
+        """Updates the moments of rewards by a rollout [*B, T], and rescales its values.
 
         In the first one, before which nothing was trained on, observations come first.
         """
         agent, normalization = self._agent, self._agent.normalization
         if normalization is None:
             return
-        unit = normalization.unit(rollout[agent.value_key])
+        unit = normalization.unit(rollout["state_value"])
         if normalization.returns is not None:
             normalization.returns.update(self._discounted(rollout))
         if first:
             normalization.update_observations(rollout)
             set_values(agent, rollout, level)
         else:
-            change = normalization.unit(rollout[agent.value_key]) / unit
-            for key in (agent.value_key, ("next", agent.value_key)):
+            change = normalization.unit(rollout["state_value"]) / unit
+            for key in ("state_value", ("next", "state_value")):
                 rollout.set(key, rollout[key] * change)
 
     def after(self, rollout: TensorDictBase, *, first: bool) -> None:
-        """Updates the moments of observations by a rollout [*B, T] that has been trained on."""
+        """Updates the moments of observations by a rollout [*B, T] that was trained on."""
         if self._agent.normalization is not None and not first:
             self._agent.normalization.update_observations(rollout)
 
     def in_units(self, steps: TensorDictBase) -> TensorDictBase:
-        """Returns steps with values, targets and advantages in the unit of the agent's values."""
-        value, normalization = self._agent.value_key, self._agent.normalization
+        """Divides values, targets and advantages by the unit of the agent's values."""
+        normalization = self._agent.normalization
         if normalization is not None and normalization.returns is not None:
-            unit = normalization.unit(steps[value])
-            for key in {value, ACTED_VALUE, "value_target", "advantage"} & set(steps.keys()):
+            unit = normalization.unit(steps["state_value"])
+            for key in {"state_value", ACTED_VALUE, "value_target", "advantage"} & set(
+                steps.keys()
+            ):
                 steps.set(key, steps[key] / unit)
         return steps
 
     def _discounted(self, rollout: TensorDictBase) -> Tensor:
-        """Returns the sum of an episode's discounted rewards up to each step, float64 [*B, T]."""
+        """Sums the discounted rewards of an episode up to each step, float64 [*B, T]."""
         reward = rollout["next", "reward"].squeeze(-1).double()
         going_on = ~rollout["next", "done"].squeeze(-1)
         sums, so_far = [], self.discounted

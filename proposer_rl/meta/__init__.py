@@ -1,1 +1,1 @@
-"""The paper's method: training a Solver as an environment, in which a Proposer acts and learns."""
+"""The paper's method: a Proposer learns in an environment whose steps train a Solver."""

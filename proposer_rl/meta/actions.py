@@ -1,4 +1,4 @@
-"""Turns an action of the Proposer into bins: one of the space's N for each of P levels.
+"""Turns the Proposer's actions into bins: one of N for each of P levels.
 
 A bin is a number, whatever it stands for; the task's space turns bins into levels.
 """
@@ -18,7 +18,7 @@ from proposer_rl.task import Space, refuse_unfit_bins
 
 
 class Actions(ABC):
-    """Turns the actions of K students into levels; a subclass defines what an action is.
+    """Turns the actions of K students into levels; subclasses define what an action is.
 
     Args:
         space: the bins, and the levels in them.
@@ -45,7 +45,7 @@ class Actions(ABC):
     def levels(
         self, action: Tensor, batch_size: int, streams: Sequence[Streams]
     ) -> tuple[Any, Tensor]:
-        """Draws levels [K, P] of actions [K, ...]; returns them, and their bins int64 [K, P].
+        """Draws levels [K, P] for actions [K, ...]; returns them and their bins int64 [K, P].
 
         Both are drawn on the host, where level generators work; the device meanwhile finishes what
         it has to do.
@@ -63,7 +63,7 @@ class Actions(ABC):
 
 
 class ProblemChoices(Actions):
-    """An action names the bin of every level: int64 [K, P] (the paper's Proposer, section 4).
+    """Lets an action name the bin of every level: int64 [K, P] (the paper's Proposer, section 4).
 
     The P draws are independent, so that all batches of one policy look alike: the composition of
     a batch varies by about 1 / sqrt(P) only.
@@ -84,12 +84,12 @@ class ProblemChoices(Actions):
     def draw(
         self, action: Tensor, batch_size: int, generators: Sequence[torch.Generator]
     ) -> Tensor:
-        """Returns the action itself, repeated if the batch is larger; nothing is drawn."""
+        """Returns the action itself, repeated if the batch is larger, without drawing."""
         return action.repeat(1, -(-batch_size // action.shape[1]))[:, :batch_size]
 
 
 class Mixture(Actions):
-    """An action is a mixture of bins from which the whole batch is drawn.
+    """Lets an action be a mixture of bins from which the whole batch is drawn.
 
     Action a, float [K, D], stands for the mixture softmax(a @ directions), [K, N]: the zero action
     is the uniform one. Batches of one policy really differ then, and what the Solver gained can be
@@ -122,7 +122,7 @@ class Mixture(Actions):
         return Unbounded((students, self.directions.shape[0]), device=device)
 
     def shares(self, action: Tensor) -> Tensor:
-        """Returns the mixtures of actions [*B, D]: shares [*B, N] that add up to one."""
+        """Returns the mixtures of actions [*B, D] as shares [*B, N] that add up to one."""
         return (action @ self.directions).softmax(-1)
 
     def draw(
@@ -133,7 +133,7 @@ class Mixture(Actions):
 
 
 def systematic_draw(shares: Tensor, count: int, generators: Sequence[torch.Generator]) -> Tensor:
-    """Draws bins that occur as often as their shares of ``count`` say, rounded up or down.
+    """Draws bins so that each occurs ``count`` times its share, rounded up or down.
 
     Systematic sampling: one random offset, then a mark in each ``count``-th part of the cumulated
     shares; in random order.

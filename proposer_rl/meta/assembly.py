@@ -1,4 +1,4 @@
-"""The parts of a run, and a Proposer's network, actions and environment from its settings."""
+"""The parts of a run, and the Proposer's network, actions and environment from its settings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from proposer_rl.task import Task
 
 @settings
 class MixtureSettings:
-    """The settings of actions that are mixtures of bins, from which whole batches are drawn.
+    """Settings of actions that are mixtures of bins for a whole batch.
 
     Attributes:
         spread: standard deviation of the first policy.
@@ -35,7 +35,7 @@ class MixtureSettings:
 
 @settings
 class ProblemSettings:
-    """The settings of actions that name the bin of every level (the paper's Proposer).
+    """Settings of actions that name the bin of every level (the paper's Proposer).
 
     Attributes:
         ratio: PPO's ratio over the P draws together, or for each draw.
@@ -49,7 +49,7 @@ class ProblemSettings:
 
 @settings
 class ProposerSettings:
-    """The settings of a Proposer and its meta-environment: not the paper's, but what learns best.
+    """Settings of a Proposer and its meta-environment; the defaults learn best, unlike the paper's.
 
     Attributes:
         rollouts: number K of replicas of the Solver that are trained side by side.
@@ -108,7 +108,7 @@ class Components(NamedTuple):
     workers: Workers | None = None
 
     def optional(self, name: str) -> Any:
-        """Returns what the task has of a name, such as ``edit``, or None if it has none."""
+        """Returns an attribute of the task, such as ``edit``, or None if it has none."""
         try:
             return getattr(self.task, name)
         except (AttributeError, ArgumentError):  # the latter of a space without a target
@@ -148,20 +148,20 @@ def meta_env(
 
 
 def solver_view(task: Task, config: ProposerSettings) -> SolverView:
-    """Makes what a Proposer with these settings sees of a Solver."""
+    """Makes the Proposer's view of a Solver from its settings."""
     return SolverView(
         task, validation_levels=config.validation_levels, probe_levels=config.probe_levels
     )
 
 
 def proposer_actions(task: Task, config: ProposerSettings) -> Actions:
-    """Makes what the actions of a Proposer with these settings mean."""
+    """Makes the meaning of the Proposer's actions from its settings."""
     kinds = {MixtureSettings: Mixture, ProblemSettings: ProblemChoices}
     return kinds[type(config.action)](task.space)
 
 
 def proposer_agent(task: Task, config: ProposerSettings) -> ActorCritic:
-    """Makes a Proposer's policy and critic, with weights from torch's default generator."""
+    """Makes the Proposer's policy and critic, with weights from torch's default generator."""
     action, hidden = config.action, config.hidden
     width = config.context + len(config.observes)
     head: nn.Module

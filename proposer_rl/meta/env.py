@@ -1,6 +1,6 @@
-"""The meta-environment: one step trains K Solvers on proposed levels, and looks at them.
+"""The meta-environment: one step trains K Solvers on proposed levels, and observes them.
 
-From top to bottom: what is trained (:class:`Learner`), what a Proposer sees of it
+From top to bottom: what is trained (:class:`Learner`), how a Proposer sees it
 (:class:`SolverView`), and the environment itself.
 """
 
@@ -26,7 +26,7 @@ from proposer_rl.task import Task
 
 
 class Learner(Protocol):
-    """The interface of K learners, each of which trains on P levels at every update.
+    """The interface of K learners, each of which trains on P levels in every update.
 
     Each trains as if it were alone. :class:`~proposer_rl.learning.PPO` of a population is a
     learner; ``examples/own_learner.py`` shows another kind.
@@ -49,7 +49,7 @@ class Learner(Protocol):
     def horizon(self) -> int: ...  # noqa: D102
 
     def update(self, generators: list[torch.Generator]) -> Update:
-        """Trains on the levels that are set; learner k draws from the k-th generator."""
+        """Trains on the levels that were set; learner k draws from the k-th generator."""
 
     def check(self, first: int = 0) -> None:
         """Raises a DivergedError if a number of the last update is not finite.
@@ -59,14 +59,14 @@ class Learner(Protocol):
         """
 
     def snapshot(self) -> TensorDict:
-        """Returns a copy of all that an update changes, batch [K]."""
+        """Copies all that an update changes, batch [K]."""
 
     def restore(self, snapshot: TensorDictBase) -> None:
-        """Puts a snapshot [K] back."""
+        """Restores a snapshot [K]."""
 
 
 class SolverView:
-    """A Proposer's observation of Solvers: their performance and outputs on target levels.
+    """Observes Solvers for a Proposer: performance and outputs on target levels.
 
     The validation levels, on which performance is measured, and the probe levels, on which answers
     are shown, are drawn anew for every cycle.
@@ -92,7 +92,7 @@ class SolverView:
 
     @torch.no_grad()
     def performance(self, agent: ActorCritic, *place: int) -> TensorDictBase:
-        """Returns what K Solvers reach on the validation levels, a tensordict [K, E].
+        """Measures K Solvers on the validation levels: a tensordict [K, E].
 
         A task that evaluates by playing draws from a stream of its own for every ``place``, the
         numbers that tell the evaluations of a cycle apart.
@@ -102,13 +102,13 @@ class SolverView:
 
     @torch.no_grad()
     def probe(self, agent: ActorCritic) -> Tensor:
-        """Returns the answers of K Solvers on the probe levels, float [K, C, ...]."""
+        """Returns the outputs of K Solvers on the probe levels, float [K, C, ...]."""
         return self.task.probe(agent, self.probes)
 
     def observation(
         self, performance: TensorDictBase, probes: Tensor, progress: float
     ) -> TensorDict:
-        """Returns the Proposer's observation of K Solvers.
+        """Makes the Proposer's observation of K Solvers.
 
         Args:
             performance: on the validation levels, [K, E].
@@ -134,7 +134,7 @@ class SolverView:
 
 @signed
 class SolverTrainingEnv(EnvBase):
-    """An environment in which K Solvers train as a batch of K episodes (the paper's section 5).
+    """Trains K Solvers as a batch of K episodes (the paper's section 5).
 
     An action says which P levels the Solvers train on. A step generates those levels, updates each
     Solver on its own ones, and observes it. An episode is ``meta_episode_length`` updates of
@@ -197,21 +197,21 @@ class SolverTrainingEnv(EnvBase):
 
     @property
     def steps(self) -> int:
-        """Returns the number of steps, that is of actions, of an episode."""
+        """The number of steps, that is of actions, in an episode."""
         return self.meta_episode_length // self.action_repeat
 
     @property
     def batch_of_levels(self) -> int:
-        """Returns the number P of levels of an update."""
+        """The number P of levels in an update."""
         return int(self.solvers.env.batch_size[1:].numel())
 
     @property
     def frames_per_update(self) -> int:
-        """Returns the number of environment steps of one Solver's update."""
+        """The number of environment steps in one Solver's update."""
         return self.batch_of_levels * self.solvers.horizon
 
     def fork(self, solver: TensorDictBase, streams: Streams) -> None:
-        """Lets the next episodes start from one Solver, on new validation and probe levels.
+        """Starts the next episodes from one Solver, with new validation and probe levels.
 
         Args:
             solver: a snapshot of it, batch [] (weights and Adam's state).
@@ -251,7 +251,7 @@ class SolverTrainingEnv(EnvBase):
         return state.set("reward", torch.stack(rewards).sum(0).unsqueeze(-1))
 
     def _train(self, action: Tensor, *, measure: bool) -> tuple[Tensor, Tensor]:
-        """Updates every Solver; returns the rewards [K], and the bins that were drawn [K, P]."""
+        """Updates every Solver; returns the rewards [K] and the drawn bins [K, P]."""
         streams = [self.streams.within(self._episode, self._updates, k) for k in self._replicas]
         levels, choices = self.actions.levels(action, self.batch_of_levels, streams)
         self.solvers.env.set_levels(levels)
@@ -301,5 +301,5 @@ class SolverTrainingEnv(EnvBase):
 
 
 def action_generators(streams: Streams, replicas: range) -> list[torch.Generator]:
-    """Returns the generator of the Proposer's actions on each of these replicas of a cycle."""
+    """Returns a generator of the Proposer's actions for each of these replicas."""
     return [streams.generator("proposals", replica) for replica in replicas]

@@ -1,4 +1,4 @@
-"""Estimates from gradients what training on a level would do to a Solver, without training it.
+"""Estimates from gradients how training on a level would change a Solver.
 
 Training moves a Solver's parameters from theta to theta + d, and the performance R on the target by
 
@@ -71,7 +71,7 @@ LevelValue = Callable[[ActorCritic, int, Tensor], Tensor]
 
 
 def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
-    """Returns R of K Solvers, float [K], from their performance on levels [K, E] of the target.
+    """Computes the performance R of K Solvers, float [K], on levels [K, E] of the target.
 
     Args:
         performance: with ``return`` or ``success``, and gradients.
@@ -95,29 +95,18 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
 
 
 def target_direction(learner: PPO | Replica, performance: Tensor) -> dict[str, Tensor]:
-    """Returns the target direction of K Solvers, each scaled to a root mean square of 1.
+    """Computes the target direction of K Solvers, each with a root mean square of 1.
+
+    It is the gradient of the performance, divided by what Adam divides its step by. Before Adam's
+    first step there is no second moment, and nothing is divided.
 
     Args:
-        learner: whose agent the performance is of.
+        learner: whose agent the performance is of, and whose Adam says how steps are scaled.
         performance: exact R of each Solver, float [K], with gradients towards the agent's
             parameters; see :func:`target_performance`.
 
     Raises:
         DivergedError: if the gradient of a Solver is zero, or not finite.
-    """
-    direction = in_adams_units(learner, performance)
-    _require_none(root_mean_square(direction) == 0, "the target direction is zero")
-    return scaled(direction)
-
-
-def in_adams_units(learner: PPO | Replica, performance: Tensor) -> dict[str, Tensor]:
-    """Returns the gradient of a performance, divided by what Adam divides its step by.
-
-    Before Adam's first step there is no second moment, and nothing is divided.
-
-    Args:
-        learner: whose agent the performance is of, and whose Adam says how steps are scaled.
-        performance: of each Solver, float [K], with gradients towards the agent's parameters.
     """
     parameters = trainable(learner.agent)
     gradients = torch.autograd.grad(
@@ -130,28 +119,19 @@ def in_adams_units(learner: PPO | Replica, performance: Tensor) -> dict[str, Ten
         bias = 1 - SECOND_MOMENT_DECAY**step
         moment = torch.where(step > 0, state[name, "exp_avg_sq"] / bias, torch.ones_like(gradient))
         direction[name] = gradient / (moment.sqrt() + learner.settings.adam_eps)
-    return direction
-
-
-def trainable(agent: nn.Module) -> dict[str, nn.Parameter]:
-    """Returns the parameters of an agent by their names, without those that are frozen."""
-    return {name: p for name, p in agent.named_parameters() if p.requires_grad}
-
-
-def scaled(direction: Direction) -> dict[str, Tensor]:
-    """Returns a direction of K Solvers, each scaled to a root mean square of 1; zero stays zero.
-
-    Raises:
-        DivergedError: if that of a Solver is not finite.
-    """
     size = root_mean_square(direction)
+    _require_none(size == 0, "the target direction is zero")
     _require_none(~size.isfinite(), "the target direction is not finite")
-    size = torch.where(size > 0, size, torch.ones_like(size))
     return {name: entry / expand_as_right(size, entry) for name, entry in direction.items()}
 
 
+def trainable(agent: nn.Module) -> dict[str, nn.Parameter]:
+    """Returns the parameters of an agent by name, without frozen ones."""
+    return {name: p for name, p in agent.named_parameters() if p.requires_grad}
+
+
 def _require_none(wrong: Tensor, why: str) -> None:
-    """Raises a DivergedError that names the Solvers with which something is wrong, bool [K]."""
+    """Raises a DivergedError that names the Solvers for which something is wrong, bool [K]."""
     if bool(wrong.any()):
         which = ", ".join(map(str, torch.nonzero(wrong).flatten().tolist()))
         raise DivergedError(f"copy {which}: {why}")
@@ -169,7 +149,7 @@ def root_mean_square(direction: Direction) -> Tensor:
 
 @contextmanager
 def moved_along(agent: ActorCritic, direction: Direction, step: float) -> Iterator[None]:
-    """Moves K Solvers by ``step`` along a direction; afterwards they are bit by bit as before."""
+    """Moves K Solvers by ``step`` along a direction, and then restores them bit by bit."""
     parameters = trainable(agent)
     before = {name: parameter.detach().clone() for name, parameter in parameters.items()}
     try:
@@ -187,7 +167,7 @@ def moved_along(agent: ActorCritic, direction: Direction, step: float) -> Iterat
 def alignment(
     agent: ActorCritic, direction: Direction, step: float, gained: Callable[[], Tensor]
 ) -> Tensor:
-    """Returns the slope along a direction of what K Solvers get, by a central difference.
+    """Computes the slope of what K Solvers gain along a direction, by a central difference.
 
     Two forward passes suffice on any kind of network, also where neither forward-mode nor second
     derivatives exist.
@@ -222,7 +202,7 @@ def alignment(
 def exact_direction(
     task: DifferentiableTask, learner: PPO | Replica, levels: Levels, measure: str
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Returns R of K Solvers on levels [K, E] of the target, float [K], and their directions.
+    """Computes R of K Solvers on levels [K, E] of the target, float [K], and their directions.
 
     Raises:
         DivergedError: where :func:`target_performance` or :func:`target_direction` does.
@@ -240,7 +220,7 @@ def exact_alignment(
     levels: Levels,
     step: float = 1.0,
 ) -> Tensor:
-    """Returns the alignment of levels [K, E] by differences of ``step`` learning rates, [K, E]."""
+    """Computes the alignment of levels [K, E] by differences of ``step`` learning rates, [K, E]."""
     return alignment(
         learner.agent,
         direction,
@@ -250,7 +230,7 @@ def exact_alignment(
 
 
 def surrogate(agent: ActorCritic, rollout: TensorDictBase, advantage: Tensor) -> Tensor:
-    """Returns the mean over the steps of each problem of A_t log pi(a_t | s_t), float [K, P].
+    """Averages A_t log pi(a_t | s_t) over the steps of each problem: float [K, P].
 
     Its gradient is the policy gradient of each problem; the mean over problems is the batch's.
 
@@ -263,7 +243,7 @@ def surrogate(agent: ActorCritic, rollout: TensorDictBase, advantage: Tensor) ->
 
 
 def over_steps(values: Tensor, rollout: TensorDictBase) -> Tensor:
-    """Returns the mean over the steps of each problem, float [K, P], of values [K, P, T].
+    """Averages values [K, P, T] over the steps of each problem: float [K, P].
 
     Episodes of several lengths are filled up to one length; ``is_step`` of the rollout, bool
     [K, P, T], says which steps were played. Without it all were.
@@ -279,13 +259,13 @@ def log_probabilities(agent: ActorCritic, rollout: TensorDictBase) -> Tensor:
     context = agent.encode(rollout.select(*agent.level_keys)[..., 0])
     with set_recurrent_mode(True):
         steps = agent.decode(rollout.select(*agent.step_keys), context)
-    log_prob = agent.distribution(steps).log_prob(rollout[agent.action_key])
+    log_prob = agent.distribution(steps).log_prob(rollout["action"])
     # An action of several parts has one log-probability for each of them.
     return log_prob.reshape(*rollout.batch_size, -1).sum(-1)
 
 
 def bin_scores(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the mean of each bin's alignments and its standard error, float [K, N] each.
+    """Returns mean and standard error of each bin's alignments, float [K, N] each.
 
     Args:
         values: alignments of C candidates of each of N bins, float [K, N, C]. The standard error of
@@ -312,7 +292,7 @@ class LevelGradients:
         self._task, self._agent = task, task.learner([Streams(0)] * LEVELS_AT_ONCE).agent
 
     def of_returns(self, learner: PPO | Replica, levels: Levels) -> Tensor:
-        """Returns |grad|^2 of the exact return of levels, of a differentiable task.
+        """Returns |grad|^2 of the exact return of levels; the task must be differentiable.
 
         Args:
             learner: of K Solvers.
@@ -355,7 +335,7 @@ class LevelGradients:
     def lengths(
         self, learner: PPO | Replica, value: LevelValue, solvers: int, count: int
     ) -> Tensor:
-        """Returns |grad|^2 of any value of a level, for K Solvers with n levels each, [K, n]."""
+        """Returns |grad|^2 of any value of a level, for K Solvers with n levels each: [K, n]."""
         parameters = trainable(self._agent)
         parts = []
         for solver in range(solvers):

@@ -1,8 +1,8 @@
-"""The K replicas of a cycle: in this process, or in workers by TorchRL's collectors.
+"""Trains the K replicas of a cycle, in this process or in workers with TorchRL's collectors.
 
-A worker, on this machine or another, holds and trains its own share of the replicas. Every random
-number belongs to a replica's number, so that its results are the same wherever it is computed, but
-for rounding.
+A worker, on this machine or another, holds and trains a share of the replicas. Every random number
+belongs to the number of a replica, so results are the same wherever they are computed, up to
+rounding.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from proposer_rl.task import Task
 
 
 class Replicas:
-    """Trains K replicas of the Solver while the Proposer acts on them, all in this process.
+    """Trains K replicas of the Solver in this process while the Proposer acts on them.
 
     Args:
         proposer: PPO whose environment is a :class:`~proposer_rl.meta.env.SolverTrainingEnv`.
@@ -55,14 +55,14 @@ class Replicas:
         return self._proposer.collect(action_generators(streams, replicas))
 
     def close(self) -> None:
-        """Ends all processes that it has started; a further episode starts others."""
+        """Ends the processes that were started; the next episode starts new ones."""
 
 
 ATTEMPTS = 3
 
 
 class ReplicasInWorkers(Replicas):
-    """Trains the replicas in workers, other processes that have a share of them each.
+    """Trains the replicas in worker processes, each of which has a share of them.
 
     Where a worker is lost, all are started anew and the episode is repeated, with the same numbers.
 
@@ -129,7 +129,7 @@ class ReplicasInWorkers(Replicas):
         return self._proposer.complete(rollout)
 
     def close(self) -> None:
-        """Ends the workers; a further episode starts others."""
+        """Ends the workers; the next episode starts new ones."""
         collector, self._collector = self._collector, None
         if collector is not None:
             stop(collector)
@@ -152,10 +152,10 @@ class ReplicasInWorkers(Replicas):
         return rollouts, collector.get_distant_attr("env.diverged")
 
     def _start(self) -> BaseCollector:
-        """Starts workers with an environment and a policy each."""
+        """Starts workers, each with an environment and a policy."""
         horizon, threads = self._proposer.settings.horizon, torch.get_num_threads()
         agent = deepcopy(self._proposer.agent).cpu()
-        shape = self._env.full_action_spec[agent.action_key].shape[1:]
+        shape = self._env.full_action_spec["action"].shape[1:]
         placed = list(zip(self._shares, cycle(self._settings.devices), strict=False))
         return start(
             self._settings,
@@ -171,7 +171,7 @@ class ReplicasInWorkers(Replicas):
 
 
 class WorkerEnv(SolverTrainingEnv):
-    """The meta-environment of a worker, which survives a Solver that diverges, and reports it.
+    """The meta-environment in a worker: reports a Solver that diverges instead of raising.
 
     An exception would end the collector's process, and the worker would be replaced in vain.
 
@@ -183,7 +183,7 @@ class WorkerEnv(SolverTrainingEnv):
     diverged: str | None = None
 
     def fork(self, solver: TensorDictBase, streams: Streams) -> None:
-        """Lets the next episodes start from one Solver; see :meth:`SolverTrainingEnv.fork`."""
+        """Starts the next episodes from one Solver; see :meth:`SolverTrainingEnv.fork`."""
         self.diverged = None
         super().fork(solver, streams)
 
@@ -211,7 +211,7 @@ def worker_env(
     device: str,
     threads: int,
 ) -> SolverTrainingEnv:
-    """Makes the environment of a worker, in its process.
+    """Makes the environment of a worker, inside its process.
 
     Args:
         make_task: makes the task on a device.
@@ -228,7 +228,7 @@ def worker_env(
 
 
 class WorkerPolicy(RolloutPolicy):
-    """The Proposer in a worker; it gets its weights before every rollout.
+    """The Proposer in a worker, which gets its weights before every rollout.
 
     Args:
         agent: with any weights.
@@ -243,7 +243,7 @@ class WorkerPolicy(RolloutPolicy):
         self.shape = shape
 
     def start(self, weights: TensorDictBase, streams: Streams, share: range) -> None:
-        """Prepares a rollout with these weights, on the replicas whose numbers are ``share``."""
+        """Prepares a rollout with these weights on the replicas numbered ``share``."""
         (agent,) = self._agent
         for name, parameter in agent.named_parameters():
             parameter.data.copy_(weights[name])
@@ -254,11 +254,10 @@ class WorkerPolicy(RolloutPolicy):
 
 
 def shares(replicas: int, workers: int) -> list[range]:
-    """Returns the numbers of K replicas in a range for each worker, all of the same length.
+    """Splits K replicas into ranges of equal length, one for each worker.
 
     Where K is no multiple of the workers, the last ranges overlap: what one process has to do
     takes no longer for it, and TorchRL's collectors want batches of one shape.
-
     """
     each = -(-replicas // workers)
     starts = [min(worker * each, replicas - each) for worker in range(workers)]

@@ -17,7 +17,7 @@ LEAST_SUCCESS = 1e-3
 
 
 class TrainingStep(NamedTuple):
-    """One PPO update of K Solvers, from which a Proposer's reward is computed.
+    """One PPO update of K Solvers, from which the Proposer's reward is computed.
 
     Attributes:
         levels: what they trained on, batch [K, P].
@@ -40,7 +40,7 @@ Reward = Callable[[TrainingStep], Tensor]
 
 
 def performance_gain(step: TrainingStep) -> Tensor:
-    """Returns how much the mean return on the validation levels went up: R(after) - R(before).
+    """Returns the gain in mean return on the validation levels: R(after) - R(before).
 
     The paper's reward (its section on the method; docs/explanation/method.md).
 
@@ -57,7 +57,7 @@ def performance_gain(step: TrainingStep) -> Tensor:
 
 
 def log_success_gain(step: TrainingStep) -> Tensor:
-    """Returns how much the mean of log(success + 0.001) on the validation levels went up.
+    """Returns the gain in mean log(success + 0.001) on the validation levels.
 
     This is the default. A beginner's return on the target hardly moves, whatever it trains on: from
     one success in five hundred to one in a hundred is a step of 0.008. The logarithm of its success
@@ -67,7 +67,7 @@ def log_success_gain(step: TrainingStep) -> Tensor:
 
 
 def task_difficulty(step: TrainingStep) -> Tensor:
-    """Returns one minus the success rate on the levels just proposed (the paper's ablation).
+    """Returns one minus the success rate on the proposed levels (the paper's ablation).
 
     It is the success rate of the Solver's own training episodes, the first on every level. Where
     episodes go on from update to update, the first to end may have begun on a level of the update

@@ -1,4 +1,4 @@
-"""Starts and ends workers, by TorchRL's collectors: processes of this machine, or Ray's on any."""
+"""Starts and ends workers with TorchRL's collectors: local processes, or Ray actors."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def start(
     check: Callable[[], None],
     patient: bool,
 ) -> BaseCollector:
-    """Starts the workers, and returns the collector that gives them orders.
+    """Starts the workers, and returns the collector that controls them.
 
     Args:
         settings: how many workers there are, and where.
@@ -116,7 +116,7 @@ def start(
 
 
 def lost(settings: WorkerSettings) -> tuple[type[Exception], ...]:
-    """Returns the exception classes by which a collector reports a lost worker."""
+    """Returns the exceptions by which a collector reports a lost worker."""
     if settings.engine != "ray":
         return LOST
     from ray.exceptions import RayError
@@ -125,7 +125,7 @@ def lost(settings: WorkerSettings) -> tuple[type[Exception], ...]:
 
 
 def stop(collector: BaseCollector) -> None:
-    """Ends the workers, whatever state they are in; of Ray's also the connection to the cluster."""
+    """Ends the workers in any state, and for Ray's the connection to the cluster."""
     with quiet(), suppress(Exception):  # of a collector whose workers are gone
         collector.shutdown(timeout=SECONDS_TO_CLOSE)
     if not isinstance(collector, MultiSyncCollector):
@@ -139,7 +139,7 @@ def stop(collector: BaseCollector) -> None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Puts back the number of threads, which TorchRL's collectors change; hides two warnings.
+    """Restores the number of threads, which TorchRL's collectors change, and hides two warnings.
 
     Both say that a worker's policy gets no weights: they come with every order.
     """
@@ -156,7 +156,7 @@ def quiet() -> Iterator[None]:
 def _cluster_share(
     settings: WorkerSettings, check: Callable[[], None], patient: bool
 ) -> dict[str, Any]:
-    """Connects to the cluster, or starts one; returns what of it a worker reserves.
+    """Connects to the cluster, or starts one; returns the share that a worker reserves.
 
     Raises:
         WorkersError: if it does not answer, or does not have as much.
@@ -190,7 +190,7 @@ def _cluster_share(
 
 
 def _short_of(share: dict[str, Any], workers: int) -> str | None:
-    """Returns why the cluster's machines have no room for the workers; None where they have."""
+    """Returns why the cluster has no room for the workers; None if it has."""
     import ray
 
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
@@ -211,7 +211,7 @@ def _short_of(share: dict[str, Any], workers: int) -> str | None:
 
 
 def _wait_for_all(collector: Any, settings: WorkerSettings, check: Callable[[], None]) -> None:
-    """Waits until every worker has begun."""
+    """Waits until every worker has started."""
     import ray
 
     workers = settings.workers
@@ -231,7 +231,7 @@ def _wait_for_all(collector: Any, settings: WorkerSettings, check: Callable[[], 
 def _wait(
     reason: Callable[[], str | None], workers: int, limit: float, check: Callable[[], None]
 ) -> None:
-    """Waits until a function returns no reason to wait; warns of the reason where it takes long.
+    """Waits until a function returns no reason to wait, and warns of the reason now and then.
 
     Raises:
         WorkersError: with the reason, where there still is one after ``limit`` seconds.
@@ -249,7 +249,7 @@ def _wait(
 
 
 def _connect(cluster: dict[str, Any], check: Callable[[], None]) -> None:
-    """Connects to a Ray cluster in another thread, which lives as long as the connection.
+    """Connects to a Ray cluster in a thread that lives as long as the connection.
 
     Ray puts handlers of its own in the place of those that save before the process ends, but only
     in the main thread; and it goes on asking for a cluster for minutes. Linux ends the processes of

@@ -1,4 +1,4 @@
-"""Networks and actor-critics of both agents; they know tensors and no environment."""
+"""Networks and actor-critics of Solver and Proposer, which know tensors and no environment."""
 
 from proposer_rl.models.actor_critic import ActorCritic as ActorCritic
 from proposer_rl.models.actor_critic import categorical as categorical

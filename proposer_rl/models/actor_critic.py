@@ -1,6 +1,6 @@
-"""An actor-critic in two parts: what is computed once per level, and what once per step.
+"""An actor-critic that reads a level once and its steps many times.
 
-And the running moments of what it sees and of its rewards, by which it is normalised.
+Also the running moments by which observations and values are normalised.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from torchrl.envs import TensorDictPrimer
 
 
 class ActorCritic(TensorDictModuleBase):
-    """Writes action logits and a state value; its ``encoder`` part depends on the level alone.
+    """Writes action logits and a state value; its ``encoder`` depends on the level alone.
 
     Called as a module it is an ordinary TorchRL actor-critic: a tensordict with one observation per
     step goes in, logits and value come out. Where the encoder's inputs stay the same throughout a
@@ -33,14 +33,13 @@ class ActorCritic(TensorDictModuleBase):
     the same numbers and T times less arithmetic.
 
     Args:
-        head: reads the encoder's outputs and the observation of a step, writes ``logits_key`` and
-            ``value_key``. With an encoder, every other input may carry time dimensions behind the
+        head: reads the encoder's outputs and the observation of a step, writes ``logits`` and
+            ``state_value``. With an encoder, every other input may carry time dimensions behind the
             batch ones, [*B, *T, ...], and the outputs then carry them too.
         encoder: reads what is constant within a level; None where nothing is.
         distribution_class: builds the action's distribution from ``logits=``.
         copies: K if parameters and data carry independent replicas as their first dimension
             (:class:`~proposer_rl.models.Population`), None for a single network.
-        action_key, log_prob_key, logits_key, value_key: the entries' names.
         memory: of a head that state, the widths of its memory by the entries' names: it reads
             them, zeros at first, writes them below ``next``, and goes through time where TorchRL's
             ``recurrent_mode()`` says so (:func:`~proposer_rl.models.memory_actor_critic`).
@@ -56,10 +55,6 @@ class ActorCritic(TensorDictModuleBase):
         *,
         distribution_class: Callable[..., Distribution] = Categorical,
         copies: int | None = None,
-        action_key: str = "action",
-        log_prob_key: str = "action_log_prob",
-        logits_key: str = "logits",
-        value_key: str = "state_value",
         memory: Mapping[str, int] | None = None,
     ) -> None:
         super().__init__()
@@ -67,34 +62,30 @@ class ActorCritic(TensorDictModuleBase):
         self.encoder = encoder
         self.distribution_class = distribution_class
         self.copies = copies
-        self.action_key = action_key
-        self.log_prob_key = log_prob_key
-        self.logits_key = logits_key
-        self.value_key = value_key
         self.level_keys = list(encoder.in_keys) if encoder is not None else []
         self.context_keys = list(encoder.out_keys) if encoder is not None else []
         self.step_keys = [key for key in head.in_keys if key not in self.context_keys]
         self.in_keys = [*self.level_keys, *self.step_keys]
         self.memory = dict(memory or {})
         self.memory_keys = [("next", key) for key in self.memory]
-        self.out_keys = [logits_key, value_key, *self.memory_keys]
+        self.out_keys = ["logits", "state_value", *self.memory_keys]
         self.normalization: Normalization | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes logits and values for a tensordict with everything in it, [*B] or [*B, T]."""
+        """Writes logits and values for a complete tensordict, [*B] or [*B, T]."""
         inputs = tensordict.select(*self.in_keys)
         if self.encoder is not None:
             inputs = self.encoder(inputs)
         return tensordict.update(self._headed(inputs), keys_to_update=self.out_keys)
 
     def encode(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Returns the context of levels [*B] (or [K, *B]): what :meth:`decode` needs of them."""
+        """Computes the context of levels [*B] (or [K, *B]) for :meth:`decode`."""
         if self.encoder is None:
             return TensorDict({}, tensordict.batch_size, device=tensordict.device)
         return self.encoder(tensordict.select(*self.level_keys)).select(*self.context_keys)
 
     def decode(self, tensordict: TensorDictBase, context: TensorDictBase) -> TensorDictBase:
-        """Writes logits and values of steps [*B, *T], given their levels' context [*B].
+        """Writes logits and values of steps [*B, *T], given the context [*B] of their levels.
 
         Without an encoder the context is empty and every step is computed by itself.
         """
@@ -112,8 +103,8 @@ class ActorCritic(TensorDictModuleBase):
         if self.normalization is None:
             return self.head(inputs)
         outputs = self.head(self.normalization.seen(inputs))
-        value = outputs.get(self.value_key)
-        return outputs.set(self.value_key, value * self.normalization.unit(value))
+        value = outputs.get("state_value")
+        return outputs.set("state_value", value * self.normalization.unit(value))
 
     def no_memory(self, tensordict: TensorDictBase) -> TensorDict:
         """Returns the memory before the first step of a batch [*B]: zeros."""
@@ -123,24 +114,24 @@ class ActorCritic(TensorDictModuleBase):
         return TensorDict(zeros, batch, device=device)
 
     def distribution(self, tensordict: TensorDictBase) -> Distribution:
-        """Returns the action's distribution, given a tensordict with logits."""
-        return self.distribution_class(logits=tensordict.get(self.logits_key))
+        """Returns the distribution of the action, given a tensordict with logits."""
+        return self.distribution_class(logits=tensordict.get("logits"))
 
     def sampler(self, *, sample: bool = False) -> ProbabilisticTensorDictModule:
         """Returns the module from logits to an action and its probability; see :meth:`actor`."""
         return ProbabilisticTensorDictModule(
-            in_keys={"logits": self.logits_key},
-            out_keys=[self.action_key],
+            in_keys=["logits"],
+            out_keys=["action"],
             distribution_class=self.distribution_class,
             return_log_prob=True,
-            log_prob_key=self.log_prob_key,
+            log_prob_key="action_log_prob",
             default_interaction_type=getattr(
                 InteractionType, "RANDOM" if sample else "DETERMINISTIC"
             ),
         )
 
     def actor(self, *, sample: bool = False) -> ProbabilisticTensorDictSequential:
-        """Returns this actor-critic as a TorchRL policy, for collectors and losses of other code.
+        """Returns this actor-critic as a TorchRL policy, for collectors and losses elsewhere.
 
         An environment around which an agent with memory acts needs its :meth:`primer`. The critic
         of a loss is the agent itself. TorchRL's ``GAE`` takes ``value_network=None``: the values of
@@ -155,7 +146,7 @@ class ActorCritic(TensorDictModuleBase):
         return ProbabilisticTensorDictSequential(self, self.sampler(sample=sample))
 
     def primer(self) -> TensorDictPrimer:
-        """Returns TorchRL's transform by which an environment begins its episodes without a memory.
+        """Returns TorchRL's transform that gives an environment the memory of this agent.
 
         ``TransformedEnv(env, agent.primer())`` hands the memory on from step to step, for rollouts
         and collectors of other code; an agent without memory needs none.
@@ -165,18 +156,18 @@ class ActorCritic(TensorDictModuleBase):
         return TensorDictPrimer(specs, default_value=0.0, expand_specs=True)
 
     def readout(self) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
-        """Returns actor and critic that take logits and values as they stand in a tensordict.
+        """Returns actor and critic that read logits and values from a tensordict.
 
         For a TorchRL loss whose caller has run this module already, so that actor and critic share
         one forward pass.
         """
-        logits = TensorDictModule(nn.Identity(), [self.logits_key], [self.logits_key])
-        value = TensorDictModule(nn.Identity(), [self.value_key], [self.value_key])
+        logits = TensorDictModule(nn.Identity(), ["logits"], ["logits"])
+        value = TensorDictModule(nn.Identity(), ["state_value"], ["state_value"])
         return ProbabilisticTensorDictSequential(logits, self.sampler()), value
 
 
 def one_copy(agent: ActorCritic, number: int) -> ActorCritic:
-    """Returns one of an agent's K copies as an agent of one, [1, ...] in the same memory."""
+    """Returns one of an agent's K copies as an agent of one, [1, ...], in shared memory."""
     own: dict[int, Any] = {
         id(p): nn.Parameter(p.detach()[number : number + 1], p.requires_grad)
         for p in agent.parameters()
@@ -190,7 +181,7 @@ def one_copy(agent: ActorCritic, number: int) -> ActorCritic:
 
 
 def joint_categorical(logits: Tensor) -> Distribution:
-    """Returns P categorical draws as one event, with the sum of their log-probabilities."""
+    """Returns P categorical draws as one event: their log-probabilities add up."""
     return Independent(Categorical(logits=logits, validate_args=False), 1)
 
 
@@ -206,7 +197,7 @@ def normal(logits: Tensor) -> Distribution:
 
 
 def distribution_of(acts: data.TensorSpec) -> Callable[..., Distribution]:
-    """Returns what makes a policy's distribution of its logits, by the actions' spec."""
+    """Chooses a policy's distribution by the spec of its actions."""
     if isinstance(acts, data.MultiCategorical):
         return joint_categorical
     return categorical if isinstance(acts, data.Categorical) else normal
@@ -237,7 +228,7 @@ def draw_at(distribution: Distribution, uniform: Tensor) -> Tensor:
 def uniform_noise(
     shape: torch.Size, steps: int, generators: list[torch.Generator] | None, device: torch.device
 ) -> Tensor:
-    """Returns uniform numbers ``[T, *shape]`` for T steps; [:, k] comes from the k-th generator.
+    """Draws uniform numbers ``[T, *shape]`` for T steps; [:, k] comes from the k-th generator.
 
     They are drawn on the CPU, so that they are the same for every device, and handed on without
     waiting for it. Without generators all of it comes from torch's default one.
@@ -268,7 +259,7 @@ TINY = 1e-8  # added to variances
 
 
 class RunningMoments(nn.Module):
-    """Mean and variance of all numbers so far, those of each replica by themselves.
+    """Keeps mean and variance of all numbers so far, separately for each replica.
 
     TorchRL's ``VecNormV2`` has one set for a whole batch of environments or one for each of them,
     and none for each row; and what a transform of an environment knows, an agent that is evaluated
@@ -309,23 +300,23 @@ class RunningMoments(nn.Module):
 
     @property
     def deviation(self) -> Tensor:
-        """Returns the standard deviation, float32 [K, *S]; 1 before the first numbers."""
+        """The standard deviation, float32 [K, *S]; 1 before the first numbers."""
         return (self.variance + TINY).sqrt().float()
 
     def forward(self, values: Tensor) -> Tensor:
-        """Returns numbers [K, *B, *S] less their mean, in standard deviations, cut off far out."""
+        """Standardises numbers [K, *B, *S] and clips them."""
         mean, deviation = (self.along(each, values) for each in (self.mean, self.deviation))
         return ((values - mean.float()) / deviation).clamp(-FARTHEST, FARTHEST)
 
     def along(self, moments: Tensor, values: Tensor) -> Tensor:
-        """Returns moments [K, *S], to be broadcast against values [K, *B, *S]."""
+        """Reshapes moments [K, *S] to broadcast against values [K, *B, *S]."""
         between = values.ndim - moments.ndim
         lead = moments.shape[: self._lead]
         return moments.reshape(*lead, *[1] * between, *moments.shape[self._lead :])
 
 
 class Normalization(nn.Module):
-    """Running standardisation of an agent's observations and of the unit of its values.
+    """Standardises an agent's observations, and keeps the unit of its values.
 
     Rewards stay what they are. Instead the critic's outputs are multiplied with the standard
     deviation of the discounted return, and its loss is taken in that unit: the same as rewards
@@ -344,20 +335,20 @@ class Normalization(nn.Module):
         self.returns = RunningMoments(copies, []) if rewards else None
 
     def seen(self, inputs: TensorDictBase) -> TensorDictBase:
-        """Returns a copy of a tensordict [K, *B] with its observations normalised."""
+        """Copies a tensordict [K, *B] with its observations normalised."""
         shown = inputs.copy()
         for name, moments in self.observations.items():
             shown.set(name, moments(inputs.get(name)))
         return shown
 
     def unit(self, values: Tensor) -> Tensor:
-        """Returns the unit of values [K, *B, 1], to be broadcast against them; 1 for none."""
+        """Returns the unit of values [K, *B, 1], ready to broadcast against them; 1 for none."""
         if self.returns is None:
             return values.new_ones(())
         return self.returns.along(self.returns.deviation, values)
 
     def update_observations(self, observed: TensorDictBase) -> None:
-        """Updates the moments by what was observed, [K, *B]."""
+        """Updates the moments by observations [K, *B]."""
         for name, moments in self.observations.items():
             assert isinstance(moments, RunningMoments)
             moments.update(observed.get(name))

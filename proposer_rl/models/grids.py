@@ -1,4 +1,4 @@
-"""Networks over whole grids: a U-Net, and its maps read at the agent's cell."""
+"""Networks over whole grids: a U-Net, and reading its maps at the agent's cell."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class DoubleConv(nn.Sequential):
 
 
 class UNet(nn.Module):
-    """Fully convolutional encoder-decoder with skip connections and 1x1 output heads.
+    """A fully convolutional encoder-decoder with skip connections and 1x1 output heads.
 
     Max-pooling on the way down, bilinear interpolation to the skip's size on the way up (so that
     any height and width works), a 1x1 head per group of output maps (Ronneberger et al. 2015; the
@@ -112,7 +112,7 @@ def upsample(maps: Tensor, size: Sequence[int]) -> Tensor:
 def _interpolation(
     height: int, width: int, to_height: int, to_width: int, device: torch.device
 ) -> Tensor:
-    """Returns weights of every input pixel in every output pixel, float32 [H * W, h * w]."""
+    """Returns the weight of every input pixel in every output pixel, float32 [H * W, h * w]."""
     with torch.inference_mode(False), torch.autocast(device.type, enabled=False):
         pixels = torch.eye(height * width, device=device).unflatten(1, (1, height, width))
         columns = F.interpolate(pixels, (to_height, to_width), mode="bilinear")
@@ -120,7 +120,7 @@ def _interpolation(
 
 
 def map_actor_critic(network: nn.Module, *, per_step: bool = False) -> ActorCritic:
-    """Returns actor-critic of a network that maps planes [*B, C, H, W] to action and value maps.
+    """Makes an actor-critic of a network from planes [*B, C, H, W] to action and value maps.
 
     It reads ``planes``, and the agent's row and column in ``agent``, int64 [*B, 2].
 
@@ -168,7 +168,7 @@ def read_maps(policy_map: Tensor, value_map: Tensor, agent: Tensor) -> tuple[Ten
 
 
 def cell_logits(agent: ActorCritic, planes: Tensor, *, gradients: bool = False) -> Tensor:
-    """Returns action logits at every cell of levels: what the agent would do wherever it stood.
+    """Returns action logits at every cell of levels, as if the agent stood there.
 
     Args:
         agent: from :func:`map_actor_critic`.

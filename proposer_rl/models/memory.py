@@ -1,4 +1,4 @@
-"""An actor-critic with memory: an LSTM that forgets where an episode begins."""
+"""An actor-critic with memory: an LSTM that starts afresh with every episode."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MEMORY = ("recurrent_state_h", "recurrent_state_c")
 
 
 class MemoryNetwork(nn.Module):
-    """Encodes each observation, remembers by an LSTM, and has one hidden layer for each head.
+    """Encodes observations, remembers them by an LSTM, and has a hidden layer for each head.
 
     TorchRL's ``LSTMModule`` splits sequences where episodes begin and pads the pieces; on a batch
     whose episodes have different lengths that is many times the work. Here all of them go on side
@@ -102,7 +102,7 @@ def memory_actor_critic(
     *,
     distribution_class: Callable[..., Distribution] = categorical,
 ) -> ActorCritic:
-    """Returns actor-critic of K networks with memory.
+    """Makes an actor-critic of K networks with memory.
 
     As with TorchRL's recurrent modules, ``torchrl.modules.set_recurrent_mode(True)`` says that the
     last batch dimension is time: the memory then goes through it from what stands at the first
@@ -150,7 +150,7 @@ class _MemoryHead(TensorDictModuleBase):
 def through_time(
     cell: LSTMCell, inputs: Tensor, rows: Tensor, begins: Tensor, memory: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """Runs an LSTM over N sequences of T steps, which forgets where an episode begins.
+    """Runs an LSTM over N sequences of T steps, from zero wherever an episode begins.
 
     Args:
         cell: has the weights of a ``torch.nn.LSTMCell``, of width M.
@@ -210,7 +210,7 @@ def _forwards(
     cells: Tensor,
     squashed: Tensor,
 ) -> None:
-    """Writes what is there after each step, and in place of what gates are given what they are."""
+    """Writes the memory after each step, and replaces the inputs of gates by their values."""
     width = hidden.shape[-1]
     for step in range(len(gates)):
         gate, keep = gates[step], kept[step]
@@ -255,7 +255,7 @@ def _backwards(
 
 
 def _compiled(steps: Any, on: Tensor) -> Any:
-    """Returns the steps as TorchScript on CPUs, which spends less time between operations."""
+    """Returns the loop over steps as TorchScript on CPUs, which has less overhead."""
     # Python 3.14 has no TorchScript; on a GPU the steps are recorded.
     if not population.at_hand(on) or sys.version_info >= (3, 14):
         return steps
@@ -275,7 +275,7 @@ def _scripted(steps: Any) -> Any:
 
 
 class _ThroughTime(torch.autograd.Function):
-    """The steps one after another, in place; shapes as above, with [K] before N and R under vmap.
+    """Runs the steps in place, one after another; under vmap [K] comes before N and R.
 
     With gates i, f, g and o of the projected inputs and the hidden state before, which is zero
     where an episode begins, as is f: c = f c' + i g and h = o tanh(c) (Hochreiter and Schmidhuber

@@ -1,6 +1,6 @@
-"""K replicas of one network as a single module, whose parameters are stacked, [K, ...].
+"""K replicas of one network as a single module with stacked parameters, [K, ...].
 
-And layers that are fast in it, and the processors that it runs on.
+Also layers that are fast in such a module, and functions that choose processors.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MANY_CHANNELS = 64  # at least, in and out
 
 
 class Population(nn.Module):
-    """K independent replicas of a network, called and trained as one module.
+    """Calls and trains K independent replicas of a network as one module.
 
     Inputs and outputs carry the replicas as their first dimension, [K, ...], and replica ``k`` sees
     only slice ``k``. The sum over replicas of each one's loss therefore gives every replica exactly
@@ -85,7 +85,7 @@ class Population(nn.Module):
         self._template = (members[0].to("meta"),)
 
     def prefer_products(self) -> None:
-        """Turns 3x3 convolutions of several replicas into products, which a compiler fuses."""
+        """Turns 3x3 convolutions of several replicas into products, which a compiler can fuse."""
         for layer in self._template[0].modules():
             if isinstance(layer, Conv3x3):
                 layer.as_product = self.copies > 1
@@ -109,7 +109,7 @@ class Population(nn.Module):
     def _call(
         self, network: nn.Module, parameters: Sequence[Tensor], inputs: Sequence[Tensor]
     ) -> tuple[Tensor, ...]:
-        """Returns outputs of the network with these parameters."""
+        """Calls a network with these parameters."""
         pairs = zip(self.places, parameters, strict=True)
         named = {name: parameter for names, parameter in pairs for name in names}
         low, device = self.precision == "bf16", parameters[0].device.type
@@ -171,7 +171,7 @@ class Conv3x3(nn.Conv2d):
 
 
 class _ProductGradient(torch.autograd.Function):
-    """``F.conv2d`` with padding 1, and its weight gradient as one matrix product."""
+    """``F.conv2d`` with padding 1, whose weight gradient is one matrix product."""
 
     generate_vmap_rule = True
 
@@ -203,7 +203,7 @@ def _neighbourhoods(maps: Tensor) -> Tensor:
 
 
 class _OnCores(torch.autograd.Function):
-    """Forward and backward of the replicas in threads, each through a graph of its own."""
+    """Runs forward and backward passes of the replicas in threads, each with its own graph."""
 
     @staticmethod
     def forward(
@@ -259,7 +259,7 @@ _networks = threading.local()
 
 
 def _own_network(network: nn.Module) -> nn.Module:
-    """Returns this thread's own copy of a template, since functional calls change it."""
+    """Returns this thread's copy of a template, because functional calls change it."""
     own = getattr(_networks, "of", None)
     if own is None or own[0] is not network:
         own = _networks.of = (network, copy.deepcopy(network))
@@ -267,19 +267,19 @@ def _own_network(network: nn.Module) -> nn.Module:
 
 
 def available_cores() -> int:
-    """Returns processors that this process may use."""
+    """Returns how many processors this process may use."""
     if hasattr(os, "sched_getaffinity"):  # not on macOS
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def at_hand(tensor: Tensor) -> bool:
-    """Returns whether a tensor's numbers can be read without waiting for a device."""
+    """Returns whether numbers of a tensor can be read without waiting for a device."""
     return tensor.device.type == "cpu"
 
 
 class TorchDefaultsError(ValueError):
-    """A default of torch's is set under which numbers would differ; the message is one line."""
+    """A default of torch's would change the numbers of a run; the message is one line."""
 
     exit_code = 2
 
@@ -304,7 +304,7 @@ def check_torch_defaults() -> None:
 
 
 def use_device(device: torch.device) -> None:
-    """Makes a GPU the current one, whose fp32 products round their factors to TF32.
+    """Makes a GPU the current device, with TF32 products and reproducible sums.
 
     What it computes is the same every time: sums are not taken in the order in which threads come
     to be done. Without a GPU nothing is changed.

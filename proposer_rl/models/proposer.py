@@ -1,4 +1,4 @@
-"""The Proposer: from what it sees of the Solver to a distribution over what to train it on."""
+"""The Proposer's network: from its view of the Solver to a distribution of actions."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class MapEncoder(nn.Sequential):
 
 
 class ProposerNetwork(nn.Module):
-    """A network from observations to parameters of the action's distribution and a value.
+    """Maps observations to the parameters of the action distribution and to a value.
 
     An encoder reads each probe; the mean over the probes, joined by whatever else is observed, is
     the context g (the paper's Proposer, section 4). ``head`` makes the policy of g, an MLP the
@@ -120,7 +120,7 @@ class ProblemHead(nn.Module):
 
 
 class MixtureHead(nn.Module):
-    """A normal distribution over mixtures: location by an MLP of the context, scale learnt.
+    """A normal policy over mixtures; an MLP gives the location, the scale is learnt.
 
     Args:
         width: of the context.
@@ -165,7 +165,7 @@ def proposer_actor_critic(
     distribution: Callable[..., Distribution],
     observed: Sequence[str] = ("probes",),
 ) -> ActorCritic:
-    """Returns the actor-critic of a network from observations to parameters and values [*B, 1].
+    """Makes the actor-critic of a network from observations to parameters and values [*B, 1].
 
     Args:
         network: such as :class:`ProposerNetwork`.

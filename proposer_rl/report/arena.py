@@ -13,7 +13,7 @@ from matplotlib.figure import FigureBase
 
 from proposer_rl.report import statistics
 from proposer_rl.report.comparisons import TOO_FEW, Decision, difference, primary
-from proposer_rl.report.outcomes import Row, cost, factors, signed
+from proposer_rl.report.outcomes import Row, cost, factors, signed, threshold_reached
 from proposer_rl.report.statistics import ERROR, FEWEST, Estimate
 from proposer_rl.report.studies import USUAL_BASELINE, Study
 from proposer_rl.report.style import BLUE, VERMILLION, Drawing
@@ -113,27 +113,36 @@ class Arena:
             name = label if tasks == len(self.tasks) else f"{label} ({tasks} tasks)"
             leader = name if mean.value > 0 else baseline
             decision = Decision(None, TOO_FEW, p, "", None, alone, count, leader)
+            own, other = (self._reaching(each, label) for each in (label, baseline))
             where = f"In the mean over {tasks} tasks {label} differs from {baseline} by"
+            got = f"reaches the threshold on {own} of them, where {baseline} does on {other}"
             rows.append(
                 Row(
                     name,
                     between,
                     None if label == baseline else decision,
                     label in asked,
-                    f"{where} {signed(between)}, at {cost(*costs)}",
-                    f"{write(_worst(found[label]).value)} {_worst_task(found[label])}",
+                    f"{where} {signed(between)} and {got}, at {cost(*costs)}",
+                    f"{own} of {tasks}",
                     *costs,
+                    f"{write(_worst(found[label]).value)} {_worst_task(found[label])}",
                 )
             )
         return sorted(
             rows, key=lambda row: (row.label.endswith(" tasks)"), -row.difference.estimate)
         )
 
-    def _factors(self, one: str, other: str) -> list[float]:
+    def _reaching(self, one: str, other: str) -> int:
+        """Returns on how many tasks that both have most of one's runs reach the threshold."""
+        groups = [(study, study.group(one), study.group(other)) for study in self.tasks.values()]
+        return sum(threshold_reached(study, a)[0] for study, a, b in groups if a and b)
+
+    def _factors(self, one: str, other: str) -> tuple[float, float]:
         """Returns geometric means over tasks of the factors of frames and seconds."""
         groups = ([study.group(each) for each in (one, other)] for study in self.tasks.values())
         found = [factors(a, b) for a, b in groups if a and b]
-        return np.exp(np.log(found).mean(0)).tolist()
+        frames, seconds = np.exp(np.log(found).mean(0)).tolist()
+        return frames, seconds
 
 
 def arena(studies: Sequence[Study], baselines: Sequence[str] = ()) -> Arena | None:
@@ -201,8 +210,9 @@ def about_rows(arena: Arena) -> str:
         "Difference: of the means along training over seeds, method minus "
         f"{arena.baselines[0]}, in the mean over tasks, which count alike, with a 95 % interval, "
         "not corrected; by it methods are in order. p: corrected for all comparisons with the "
-        f"baseline, {count} (Holm). Worst task: its difference to {arena.reference}. ×: times what "
-        "the baseline spent, the curriculum's frames included, geometric means over tasks."
+        f"baseline, {count} (Holm). Worst task: its difference to {arena.reference}. Reached: on "
+        "how many tasks most runs get to the threshold. ×: times what the baseline spent, the "
+        "curriculum's frames included, geometric means over tasks."
     )
 
 

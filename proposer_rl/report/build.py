@@ -78,9 +78,10 @@ def write_report(
     output: Path,
     threshold: float | None = None,
     baselines: Sequence[str] = (),
+    compare: Sequence[str] = (),
+    *,
     progress: bool = True,
     meanings: Meanings | None = None,
-    compare: Sequence[str] = (),
 ) -> Path:
     """Writes a report and returns the path of its page.
 
@@ -91,11 +92,11 @@ def write_report(
         baselines: labels of methods that the others are measured against: on each task the first,
             over several tasks the best of all. Without any ``domain_randomization`` or, where that
             is missing, the first; over several tasks ``domain_randomization`` and ``target``.
+        compare: labels of the methods whose comparison was planned: p-values are corrected for
+            these alone; of none for all methods.
         progress: whether to draw a progress bar.
         meanings: what methods and ablations do, by ``method`` or ``ablation`` and name, for runs
             that do not tell.
-        compare: labels of the methods whose comparison was planned: p-values are corrected for
-            these alone; of none for all methods.
     """
     check_output(output, PAGE, f"{TABLES}/runs.csv")
     logs = [path for path in folders if path.suffix == LOG]

@@ -86,8 +86,9 @@ class Row(NamedTuple):
         decision: against the baseline; None for the baseline itself.
         asked: whether the decision is among those that are corrected together.
         says: the difference and its cost in words, as far as the decision.
-        reached: updates to the threshold, or what else is shown beside the difference.
+        reached: updates to the threshold; over several tasks on how many it is reached.
         frames, seconds: as factors of the baseline's.
+        worst: over several tasks the lowest difference, and where.
     """
 
     label: str
@@ -98,6 +99,7 @@ class Row(NamedTuple):
     reached: str
     frames: float
     seconds: float
+    worst: str = ""
 
     @property
     def verdict(self) -> str:
@@ -129,20 +131,20 @@ def first_rows(study: Study) -> list[Row]:
                 found.get(group.label),
                 group.label in asked,
                 says,
-                " ".join(_reached(study, group)[1:]),
+                " ".join(threshold_reached(study, group)[1:]),
                 *costs,
             )
         )
     return sorted(rows, key=lambda row: -row.difference.estimate)
 
 
-def factors(group: Group, baseline: Group) -> list[float]:
+def factors(group: Group, baseline: Group) -> tuple[float, float]:
     """Returns how many times the frames and the seconds of the baseline a method took."""
     found = []
     for spent in (lambda run: run.total_frames[-1], lambda run: run.own_seconds[-1]):
         own, other = (np.mean([*map(spent, each.runs)]) for each in (group, baseline))
         found.append(float(own / other) if other > 0 else math.nan)
-    return found
+    return found[0], found[1]
 
 
 def signed(difference: Interval) -> str:
@@ -160,7 +162,7 @@ def times(factor: float) -> str:
     return "–" if math.isnan(factor) else f"{float(f'{factor:.2g}'):,g}"
 
 
-def _reached(study: Study, group: Group) -> tuple[bool, str, str]:
+def threshold_reached(study: Study, group: Group) -> tuple[bool, str, str]:
     """Returns whether most runs got to the threshold, the median of their updates, how many did."""
     got = sum(run.reached(study.headline, study.threshold) >= 0 for run in group.runs)
     most, median = 2 * got > len(group.runs), waiting_outcome(study).median(group)
@@ -170,7 +172,9 @@ def _reached(study: Study, group: Group) -> tuple[bool, str, str]:
 
 def _reaching(study: Study, group: Group) -> str:
     """Returns a clause on the updates that a method and the baseline take to the threshold."""
-    (own, *first), (other, *second) = (_reached(study, each) for each in (group, study.baseline))
+    (own, *first), (other, *second) = (
+        threshold_reached(study, each) for each in (group, study.baseline)
+    )
     goal = f"{level_text(study.headline, study.threshold)} {words(study.headline)}"
     name, baseline, within = group.label, study.baseline.label, f"within {study.horizon} updates"
     takes = f"{baseline} takes {' '.join(second)}".strip()
@@ -186,7 +190,7 @@ def _reaching(study: Study, group: Group) -> str:
 def first_table(
     rows: Sequence[Row], baseline: str, shown: str, note: str, name: str = "baseline"
 ) -> Table:
-    """Returns the rows as a table; ``shown`` is the title of what stands beside the difference."""
+    """Returns the rows as a table; ``shown`` is the title of what is reached."""
     cells: list[dict[str, Cell]] = [
         {
             "method": row.label if row.decision else f"{row.label} (baseline)",
@@ -194,6 +198,7 @@ def first_table(
             "verdict": row.verdict,
             "p": row.decision and row.decision.alone,
             "p (Holm)": row.decision.p if row.decision and row.asked else None,
+            **({"worst task": row.worst} if row.worst else {}),
             shown: row.reached,
             "frames (×)": times(row.frames),
             "seconds (×)": times(row.seconds),

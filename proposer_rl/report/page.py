@@ -37,8 +37,8 @@ from proposer_rl.report.tables import Table, escape_markdown, write
 from proposer_rl.runs.records import anywhere, level_text, words
 
 PIXELS = 78  # of an inch of a figure
-WIDE = 170  # pixels of the dots of the first table
-APART = 35  # pixels between two numbers of their scale
+WIDE = 140  # pixels of the dots of the first table
+DIGIT = 6.5  # pixels of a character of their scale
 
 
 Section = dict[str, Any]  # all that the page shows of a study, as the template names it
@@ -135,9 +135,24 @@ def first(
             }
         )
     zero = place(0.0)
-    ticks = [(x, write(end)) for end in (low, high) if abs((x := place(end)) - zero) > APART]
-    ticks.append((zero, "0"))
-    return {"table": table, "rows": found, "wide": WIDE, "ticks": ticks, "zero": zero}
+    return {
+        "table": table,
+        "rows": found,
+        "wide": WIDE,
+        "ticks": _ticks([(zero, "0"), (place(low), write(low)), (place(high), write(high))]),
+        "zero": zero,
+    }
+
+
+def _ticks(wanted: Sequence[tuple[float, str]]) -> list[tuple[float, str]]:
+    """Returns those numbers of a scale that fit beside the ones before, by their centres."""
+    found: list[tuple[float, str]] = []
+    for place, text in wanted:
+        half = DIGIT * len(text) / 2
+        centre = min(max(place, half), WIDE - half)
+        if all(abs(centre - other) > half + DIGIT * (len(t) / 2 + 1) for other, t in found):
+            found.append((centre, text))
+    return found
 
 
 def first_of_study(study: Study) -> Table:
@@ -149,7 +164,7 @@ def first_of_study(study: Study) -> Table:
 def first_of_tasks(compared: arena.Arena) -> Table:
     """Returns the first table over several tasks."""
     about, baseline = arena.about_rows(compared), compared.baselines[0]
-    return first_table(compared.rows, baseline, "worst task", about, "arena_baseline")
+    return first_table(compared.rows, baseline, "reached", about, "arena_baseline")
 
 
 def facts(study: Study) -> list[tuple[str, str]]:
@@ -253,7 +268,7 @@ def _command(run: Run) -> str:
         return f"prl.train({call}{')' if run.shared_by > 1 else ', seed=seed)  # seed='}"
     arguments = run.facts.get("arguments", {})
     paths, config = arguments.get("pythonpath"), arguments.get("config_dir")
-    own = ("seed=", "seeds=", "hydra.", "+sweep=", "compute.", "logger")
+    own = ("seed=", "seeds=", "hydra.", "sweep=", "+sweep=", "compute.", "logger")
     shown = [word for word in words if not word.startswith(own)]
     many, seeds = ["-m"], "seed="
     if run.shared_by > 1:

@@ -112,7 +112,7 @@ def _read_folder(folder: Path) -> list[Run]:
 
 
 def _read_study(folder: Path) -> list[Run]:
-    """Returns the runs of a study, as ``bin/research publish`` writes it."""
+    """Returns the runs of a study, as ``bin/report --publish`` writes it."""
     tables = {name: _by_run(folder, name) for name in NAMES}
     runs = []
     for row in _table(folder / STUDY).to_dict("records"):

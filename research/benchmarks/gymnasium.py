@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from proposer_rl.cli.build import parts
 from proposer_rl.cli.config import RunConfig, read_config
 from proposer_rl.experiment.continued import ContinuedLevels
-from proposer_rl.experiment.side_by_side import SideBySide
+from proposer_rl.experiment.loop import SideBySide
 from proposer_rl.recipes import CONFIG_FOLDER, composed
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.runs.process import StopSignals
@@ -175,7 +175,7 @@ def _config(environment: str, seeds: Sequence[int], frames: int, episodes: int) 
     updates = -(-frames // (count * solver["ppo"]["horizon"]))
     own = {"task": task, "solver": {"batch_size": count, "ppo": solver["ppo"]}}
     more = {"seeds": [*seeds], "schedule": {"updates": updates}}
-    return read_config(composed(["task=gymnasium", "+method=target"], own, more))
+    return read_config(composed(["task=gymnasium", "method=target"], own, more))
 
 
 def _compared(rows: Sequence[Trained]) -> Result:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 
 from proposer_rl.curricula import Curriculum, TaskStudent, outcome_of
-from proposer_rl.experiment.side_by_side import SideBySide
+from proposer_rl.experiment.loop import SideBySide
 from proposer_rl.learning import PPO, PPOSettings, SolverSettings
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes.task import UNetSettings

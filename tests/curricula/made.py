@@ -7,29 +7,8 @@ from typing import Any
 
 import torch
 
-from proposer_rl.curricula import (
-    AdaptiveMixture,
-    BoundsCurriculum,
-    Curriculum,
-    Filtered,
-    FirstOrderCurriculum,
-    FirstOrderProposer,
-    LearningProgressCurriculum,
-    Mixed,
-    MixtureCurriculum,
-    Modelled,
-    PairedProposer,
-    ProposerCurriculum,
-    ReplayCurriculum,
-    ReplayRule,
-    RowsCurriculum,
-    SamplingCurriculum,
-    Schedule,
-    Scorer,
-    SelectionCurriculum,
-    SelfPacedCurriculum,
-    TransportCurriculum,
-)
+from proposer_rl import curricula as c
+from proposer_rl.curricula import Curriculum, ReplayCurriculum, ReplayRule, Scorer
 from proposer_rl.learning import PPOSettings
 from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.meta.rewards import log_success_gain
@@ -67,9 +46,9 @@ def ncc() -> ReplayCurriculum:
     return replay("learnability", "exact", rule=rule, renew=True)
 
 
-def selection(source: Any = "exact", rollouts: int = 2, **options: Any) -> SelectionCurriculum:
+def selection(source: Any = "exact", rollouts: int = 2, **options: Any) -> c.SelectionCurriculum:
     numbers = {"candidates": 16, "keep": 6, "every": 3, "new": 0.5, **options}
-    return SelectionCurriculum(SPACE, Scorer("learnability", source, rollouts), **numbers)
+    return c.SelectionCurriculum(SPACE, Scorer("learnability", source, rollouts), **numbers)
 
 
 def problem_agent() -> ActorCritic:
@@ -79,19 +58,19 @@ def problem_agent() -> ActorCritic:
     return proposer_actor_critic(network, categorical)
 
 
-def paired(streams: Streams | None = None) -> PairedProposer:
+def paired(streams: Streams | None = None) -> c.PairedProposer:
     antagonist = TASK.learner([streams or Streams(0, "antagonist")])
-    return PairedProposer(
+    return c.PairedProposer(
         SPACE, TARGET, problem_agent(), SETTINGS, task=TASK, antagonist=antagonist, probe_levels=2
     )
 
 
-def first_order_proposer() -> FirstOrderProposer:
+def first_order_proposer() -> c.FirstOrderProposer:
     numbers = {"probe_levels": 2, "target_levels": 3, "step": 1.0, "measure": "log_success"}
-    return FirstOrderProposer(SPACE, TARGET, problem_agent(), SETTINGS, **numbers)
+    return c.FirstOrderProposer(SPACE, TARGET, problem_agent(), SETTINGS, **numbers)
 
 
-def learnt() -> ProposerCurriculum:
+def learnt() -> c.ProposerCurriculum:
     """The paper's, in small."""
     settings = ProposerSettings(
         rollouts=2, meta_episode_length=2, action_repeat=1, validation_levels=4, probe_levels=2
@@ -99,10 +78,10 @@ def learnt() -> ProposerCurriculum:
     return proposer(Components(TASK, settings, 0), reward=log_success_gain)
 
 
-def frozen() -> ProposerCurriculum:
+def frozen() -> c.ProposerCurriculum:
     """Without a trainer."""
     learning = learnt()
-    return ProposerCurriculum(
+    return c.ProposerCurriculum(
         learning.agent,
         learning.view,
         learning.actions,
@@ -112,18 +91,18 @@ def frozen() -> ProposerCurriculum:
     )
 
 
-def filtered(curriculum: Curriculum, source: Any = "exact", times: int = 3) -> Filtered:
-    return Filtered(curriculum, Scorer("learnability", source, 2), times=times, temperature=0.05)
+def filtered(curriculum: Curriculum, source: Any = "exact", times: int = 3) -> c.Filtered:
+    return c.Filtered(curriculum, Scorer("learnability", source, 2), times=times, temperature=0.05)
 
 
-def modelled(curriculum: Curriculum) -> Modelled:
-    return Modelled(curriculum, TASK.features, half_life=2.0)
+def modelled(curriculum: Curriculum) -> c.Modelled:
+    return c.Modelled(curriculum, TASK.features, half_life=2.0)
 
 
 MADE: dict[str, Make] = {
-    "uniform": lambda: SamplingCurriculum(SPACE),
-    "filtered": lambda: filtered(SamplingCurriculum(SPACE)),
-    "filtered from episodes": lambda: filtered(SamplingCurriculum(SPACE), "episodes"),
+    "uniform": lambda: c.SamplingCurriculum(SPACE),
+    "filtered": lambda: filtered(c.SamplingCurriculum(SPACE)),
+    "filtered from episodes": lambda: filtered(c.SamplingCurriculum(SPACE), "episodes"),
     "plr": lambda: replay(train_on_new=True),
     "robust": lambda: replay(synchronous=False),
     "synchronous": replay,
@@ -142,52 +121,56 @@ MADE: dict[str, Make] = {
     "policy gradients": lambda: replay("gradient_norm"),
     "sfl": selection,
     "sfl from episodes": lambda: selection("episodes"),
-    "progress": lambda: LearningProgressCurriculum(SPACE, probes=2, every=2),
-    "progress of episodes": lambda: LearningProgressCurriculum(SPACE, source="episodes", every=2),
-    "alp_gmm": lambda: MixtureCurriculum(SPACE, warmup=8, refit=6, components=3),
-    "alp_gmm, exact": lambda: MixtureCurriculum(
+    "progress": lambda: c.LearningProgressCurriculum(SPACE, probes=2, every=2),
+    "progress of episodes": lambda: c.LearningProgressCurriculum(SPACE, source="episodes", every=2),
+    "alp_gmm": lambda: c.MixtureCurriculum(SPACE, warmup=8, refit=6, components=3),
+    "alp_gmm, exact": lambda: c.MixtureCurriculum(
         SPACE, source="exact", warmup=8, refit=6, components=3
     ),
-    "adr": lambda: BoundsCurriculum(SPACE, boundary=0.9, episodes=3, lower=0.0, upper=0.1),
-    "terrain_levels": lambda: RowsCurriculum(SPACE, measure="return", lower=0.0, upper=0.1),
-    "spdl": lambda: SelfPacedCurriculum(
+    "adr": lambda: c.BoundsCurriculum(SPACE, boundary=0.9, episodes=3, lower=0.0, upper=0.1),
+    "terrain_levels": lambda: c.RowsCurriculum(SPACE, measure="return", lower=0.0, upper=0.1),
+    "spdl": lambda: c.SelfPacedCurriculum(
         SPACE, TARGET, TASK.target_shares, delta=0.01, episodes=6, measure="return"
     ),
-    "currot": lambda: TransportCurriculum(SPACE, TASK.target_shares, delta=0.2, every=2, probes=2),
-    "adaptive_mixture": lambda: AdaptiveMixture(SPACE, TARGET, TASK.inputs),
-    "first order": lambda: FirstOrderCurriculum(SPACE, TARGET, target_levels=8, candidates=2),
+    "currot": lambda: c.TransportCurriculum(
+        SPACE, TASK.target_shares, delta=0.2, every=2, probes=2
+    ),
+    "adaptive_mixture": lambda: c.AdaptiveMixture(SPACE, TARGET, TASK.inputs),
+    "first order": lambda: c.FirstOrderCurriculum(SPACE, TARGET, target_levels=8, candidates=2),
     "filtered bins": lambda: filtered(
-        LearningProgressCurriculum(SPACE, source="episodes", every=2)
+        c.LearningProgressCurriculum(SPACE, source="episodes", every=2)
     ),
     "filtered replay": lambda: filtered(replay(train_on_new=True)),
     "filtered alp_gmm": lambda: filtered(
-        MixtureCurriculum(SPACE, warmup=8, refit=6, components=3), times=2
+        c.MixtureCurriculum(SPACE, warmup=8, refit=6, components=3), times=2
     ),
     "transport on a model": lambda: modelled(
-        filtered(TransportCurriculum(SPACE, TASK.target_shares, every=2, probes=2, exploration=0.1))
+        filtered(
+            c.TransportCurriculum(SPACE, TASK.target_shares, every=2, probes=2, exploration=0.1)
+        )
     ),
     "mixture on a model": lambda: modelled(
-        Mixed(
+        c.Mixed(
             [
-                filtered(SamplingCurriculum(SPACE)),
-                SamplingCurriculum(TARGET),
-                filtered(TransportCurriculum(SPACE, TASK.target_shares, every=2, probes=2)),
+                filtered(c.SamplingCurriculum(SPACE)),
+                c.SamplingCurriculum(TARGET),
+                filtered(c.TransportCurriculum(SPACE, TASK.target_shares, every=2, probes=2)),
             ],
             [1, 1, 1],
         )
     ),
-    "progress on a model": lambda: modelled(LearningProgressCurriculum(SPACE, probes=2)),
+    "progress on a model": lambda: modelled(c.LearningProgressCurriculum(SPACE, probes=2)),
     "edits on a model": lambda: modelled(replay("learnability", "exact", edits=3)),
-    "filter on a model": lambda: modelled(filtered(SamplingCurriculum(SPACE))),
-    "schedule": lambda: Schedule([SamplingCurriculum(SPACE), replay(train_on_new=True)], [2]),
+    "filter on a model": lambda: modelled(filtered(c.SamplingCurriculum(SPACE))),
+    "schedule": lambda: c.Schedule([c.SamplingCurriculum(SPACE), replay(train_on_new=True)], [2]),
     "filtered schedule": lambda: filtered(
-        Schedule([SamplingCurriculum(TARGET), replay(train_on_new=True)], [1])
+        c.Schedule([c.SamplingCurriculum(TARGET), replay(train_on_new=True)], [1])
     ),
-    "mixed": lambda: Mixed(
+    "mixed": lambda: c.Mixed(
         [
-            LearningProgressCurriculum(SPACE, source="episodes", every=1),
+            c.LearningProgressCurriculum(SPACE, source="episodes", every=1),
             replay(train_on_new=True),
-            SamplingCurriculum(TARGET),
+            c.SamplingCurriculum(TARGET),
         ],
         [1, 2, 1],
     ),

@@ -9,23 +9,13 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 
-from proposer_rl.curricula import (
-    Batch,
-    Curriculum,
-    Filtered,
-    LearnedCurriculum,
-    Mixed,
-    Schedule,
-    Student,
-)
+from proposer_rl.curricula import Batch, Curriculum, Filtered, Mixed, Schedule, Student
 from proposer_rl.curricula.combinators import draw_without_replacement
+from proposer_rl.curricula.contract import LearnedCurriculum
 from proposer_rl.streams import Streams
-from tests.curricula.living import TASK
 from tests.curricula.scripted import GivenScores
 
-P, T = TASK.batch_size, 8
 INF = float("inf")
 
 
@@ -63,40 +53,13 @@ def test_what_has_no_score_is_drawn_last_and_evenly() -> None:
     assert counts[1] == 0 and ((counts[[0, 2, 3]] - 2000).abs() < 200).all()
 
 
-class Numbered(Curriculum):
-    """Notes what it observes, and of how many levels each batch was."""
-
-    def __init__(self) -> None:
-        self.observed: list[tuple[list[float], int]] = []
-
-    def propose(self, student: Student, count: int, rng: Any) -> Tensor:
-        return torch.zeros(count)
-
-    def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
-        self.observed.append((outcome["return"].tolist(), batch.size))
-
-
-def test_parts_of_a_mixture_are_observed_by_whoever_proposed_them() -> None:
-    """Also of a mixture within a schedule within the mixture, whose levels are 2 to 7."""
-    parts = [Numbered() for _ in range(4)]
-    inner = Schedule([Mixed(parts[1:3], [1, 2])], [])
-    curriculum = Mixed([parts[0], inner, parts[3]], [2, 6, 1])
-    batch = curriculum.propose(Student(), 9, Streams(0))
-    for some in (torch.tensor([1, 2, 4, 7]), torch.tensor([0, 3, 8])):
-        told = TensorDict({"return": some.float()}, [len(some)])
-        curriculum.observe(Student(), batch[some], told)
-    assert [part.observed for part in parts] == [
-        [([1], 2), ([0], 2)], [([2], 2), ([3], 2)], [([4, 7], 4)], [([8], 1)],
-    ]  # fmt: skip
-
-
 class Noted(LearnedCurriculum):
-    """Levels are numbers from its first on; notes what it observes."""
+    """Levels are numbers from its first on; notes what it observes, and of batches how large."""
 
-    trains_replicas = False
+    state = ("seen",)
 
     def __init__(self, first: int) -> None:
-        self.first, self.seen, self.improved = first, [], 0
+        self.first, self.seen = first, []
 
     def propose(self, student: Student, count: int, rng: Any) -> Batch:
         levels = torch.arange(self.first, self.first + count)
@@ -104,10 +67,9 @@ class Noted(LearnedCurriculum):
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         assert (batch.notes["own"] == batch.levels).all()
-        self.seen += [batch.levels.tolist(), outcome["return"].tolist()]
+        self.seen.append((batch.levels.tolist(), outcome["return"].tolist(), batch.size))
 
     def improve(self, student: Student, rng: Any) -> dict[str, Any]:
-        self.improved += 1
         return {"improved": self.first}
 
     def log(self) -> dict[str, Any]:
@@ -116,25 +78,35 @@ class Noted(LearnedCurriculum):
     def learnt(self) -> dict[str, Any]:
         return {"first": self.first} if self.first else {}
 
-    def state_dict(self) -> dict[str, Any]:
-        return {"seen": list(self.seen)}
 
-    def load_state_dict(self, state: Any) -> None:
-        self.seen = list(state["seen"])
+def tell(curriculum: Curriculum, batch: Batch, places: Any) -> None:
+    """Some of a batch's levels come back with their places as returns."""
+    some = torch.as_tensor(places)
+    told = TensorDict({"return": some.float()}, [len(some)])
+    curriculum.observe(Student(), batch[some], told)
 
 
-def outcome(levels: Tensor) -> TensorDict:
-    return TensorDict({"return": levels.float() / 2}, levels.shape)
+def test_parts_of_a_mixture_are_observed_by_whoever_proposed_them() -> None:
+    """Also of a mixture within a schedule within the mixture, whose levels are 2 to 7."""
+    parts = [Noted(10 * i) for i in range(4)]
+    inner = Schedule([Mixed(parts[1:3], [1, 2])], [])
+    curriculum = Mixed([parts[0], inner, parts[3]], [2, 6, 1])
+    batch = curriculum.propose(Student(), 9, Streams(0))
+    tell(curriculum, batch, [1, 2, 4, 7])
+    tell(curriculum, batch, [0, 3, 8])
+    assert [part.seen for part in parts] == [
+        [([1], [1], 2), ([0], [0], 2)], [([10], [2], 2), ([11], [3], 2)],
+        [([20, 23], [4, 7], 4)], [([30], [8], 1)],
+    ]  # fmt: skip
 
 
 def test_what_is_kept_is_observed_as_if_it_alone_had_been_proposed() -> None:
-    own = Noted(0)
-    numbers = torch.tensor([0.0, 9.0, 5.0, 1.0])
+    own, numbers = Noted(0), torch.tensor([0.0, 9.0, 5.0, 1.0])
     curriculum = Filtered(own, GivenScores(numbers), times=2, temperature=1e-6)
     batch = curriculum.propose(Student(), 2, Streams(0))
     assert sorted(batch.levels.tolist()) == [1, 2]
-    curriculum.observe(Student(), batch, outcome(batch.levels))
-    assert own.seen == [batch.levels.tolist(), (batch.levels / 2).tolist()]
+    tell(curriculum, batch, [0, 1])
+    assert own.seen == [(batch.levels.tolist(), [0, 1], 2)]
 
 
 def test_a_schedule_changes_at_the_exact_batch_and_gives_back_to_whom_it_came_from() -> None:
@@ -151,9 +123,9 @@ def test_a_schedule_changes_at_the_exact_batch_and_gives_back_to_whom_it_came_fr
         assert improved == {"improved": int(batches[-1].levels[0])}
     assert [int(batch.levels[0]) for batch in batches] == [0, 0, 10, 20, 20]
     for batch in batches[::-1]:
-        curriculum.observe(Student(), batch[1:], outcome(batch.levels[1:]))
-    assert [len(stage.seen) // 2 for stage in stages] == [2, 1, 2]
-    assert stages[1].seen == [[11], [5.5]]
+        tell(curriculum, batch, [1])
+    assert [len(stage.seen) for stage in stages] == [2, 1, 2]
+    assert stages[1].seen == [([11], [1], 2)]
     assert curriculum.learnt() == {"first": 20}
     assert curriculum.log() == {"seen": stages[2].seen}
 
@@ -165,10 +137,8 @@ def test_each_curriculum_of_a_mixture_has_its_share(count: int, shares: list[int
     batch = curriculum.propose(Student(), count, Streams(0))
     assert (batch.levels // 10).bincount(minlength=3).tolist() == shares
     for place in reversed(range(count)):
-        some = batch[[place]]
-        curriculum.observe(Student(), some, outcome(some.levels))
+        tell(curriculum, batch, [place])
     for part, share in zip(parts, shares, strict=True):
-        assert sorted(level for seen in part.seen[::2] for level in seen) == [
-            part.first + i for i in range(share)
-        ]
+        seen = sorted(level for levels, *_ in part.seen for level in levels)
+        assert seen == [part.first + i for i in range(share)]
     assert curriculum.log() == {f"{i}_seen": part.seen for i, part in enumerate(parts)}

@@ -11,15 +11,12 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from proposer_rl.curricula import (
-    FirstOrderCurriculum,
-    TaskStudent,
-)
+from proposer_rl import curricula as c
 from proposer_rl.learning import PPO
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 from proposer_rl.tasks.mazes import Level, SpecificationSpace
-from proposer_rl.tasks.mazes.distributions import LevelDistribution
+from proposer_rl.tasks.mazes.generation import LevelDistribution
 from tests.meta import test_first_order as exact
 
 BINS, P = 6, 16
@@ -57,14 +54,14 @@ class Skills:
         return TensorDict({"return": torch.where(levels < 0, target, of_bins)}, levels.shape)
 
 
-def taught(task: Any, learner: Any = None) -> TaskStudent:
-    return TaskStudent(task, learner or task)
+def taught(task: Any, learner: Any = None) -> c.TaskStudent:
+    return c.TaskStudent(task, learner or task)
 
 
 def test_shares_follow_the_known_alignments() -> None:
     wanted = [2.0, 1.0, 0.0, -1.0, 0.0, 0.5]
     task = Skills(wanted)
-    curriculum = FirstOrderCurriculum(task.space, task.target, measure="return", temperature=0.5)
+    curriculum = c.FirstOrderCurriculum(task.space, task.target, measure="return", temperature=0.5)
     levels = curriculum.propose(taught(task), P, Streams(0)).levels
     # The direction is that of the wanted skills, and the alignment of bin n its n-th number.
     expected = (torch.tensor(wanted) / (0.5 * 2.0)).softmax(-1)
@@ -74,7 +71,7 @@ def test_shares_follow_the_known_alignments() -> None:
 
 def test_scores_are_averaged_over_time() -> None:
     task = Skills([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    curriculum = FirstOrderCurriculum(
+    curriculum = c.FirstOrderCurriculum(
         task.space, task.target, measure="return", every=1, smoothing=0.75
     )
     curriculum.propose(taught(task), P, Streams(0))
@@ -87,7 +84,7 @@ def test_scores_are_averaged_over_time() -> None:
 
 def test_bins_without_any_score_are_drawn_uniformly() -> None:
     task = Skills([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    curriculum = FirstOrderCurriculum(task.space, task.target, measure="return")
+    curriculum = c.FirstOrderCurriculum(task.space, task.target, measure="return")
     curriculum.scores = {"score": torch.zeros(BINS), "variance": torch.zeros(BINS)}
     torch.testing.assert_close(curriculum.shares(), torch.full((BINS,), 1 / BINS))
 
@@ -113,9 +110,9 @@ class Mazes(Skills):
         return exact.performance(agent, levels)
 
 
-def mazes(**options: Any) -> FirstOrderCurriculum:
+def mazes(**options: Any) -> c.FirstOrderCurriculum:
     task = Mazes()
-    return FirstOrderCurriculum(
+    return c.FirstOrderCurriculum(
         task.space, task.target, **{"target_levels": 8, "candidates": 3, **options}
     )
 

@@ -93,11 +93,21 @@ def curriculum(task: Any, **options: Any) -> TransportCurriculum:
     )
 
 
-def test_a_long_reach_and_nothing_to_master_give_the_target_at_once() -> None:
-    task = Scripted(torch.zeros(5), batch_size=10)
+@pytest.mark.parametrize(
+    ("skills", "delta", "epsilon", "expected"),
+    [
+        ([0.0] * 5, 0.0, 5.0, [0, 3, 0, 0, 7]),  # nothing to master: the target at once
+        ([0.0, 0.1, 0.3, 0.2, 0.0], 0.5, 0.4, [0, 0, 10, 0, 0]),  # nothing mastered: the best
+        ([0.0] * 5, 0.5, 0.01, [2] * 5),  # where all fails, all is searched
+    ],
+)
+def test_a_first_batch_is_drawn_from_what_is_mastered(
+    skills: list[float], delta: float, epsilon: float, expected: list[int]
+) -> None:
+    task = Scripted(torch.tensor(skills), batch_size=10)
     task.target_shares = torch.tensor([0.0, 0.3, 0.0, 0.0, 0.7])
-    found = curriculum(task, delta=0.0, epsilon=5.0)
-    assert step(found, task, 0).bincount(minlength=5).tolist() == [0, 3, 0, 0, 7]
+    found = curriculum(task, delta=delta, epsilon=epsilon)
+    assert step(found, task, 0).bincount(minlength=5).tolist() == expected
 
 
 def test_a_master_is_led_to_the_target_step_by_step() -> None:
@@ -131,18 +141,6 @@ def test_only_bins_that_are_mastered_are_drawn_from_and_the_way_opens_with_them(
         bins = step(found, task, update)
     assert (bins == 3).all()
     assert found.log()["allowed_bins"] == 4
-
-
-def test_where_nothing_is_mastered_the_best_bin_is_drawn_from() -> None:
-    task = Scripted(torch.tensor([0.0, 0.1, 0.3, 0.2, 0.0]))
-    found = curriculum(task, delta=0.5, epsilon=0.4)
-    assert (step(found, task, 0) == 2).all() and found.log()["allowed_bins"] == 1
-
-
-def test_where_all_fails_all_is_searched() -> None:
-    task = Scripted(torch.zeros(5), batch_size=10)
-    found = curriculum(task, delta=0.5, epsilon=0.01)
-    assert step(found, task, 0).bincount(minlength=5).tolist() == [2] * 5
 
 
 def test_uniform_draws_end_where_the_target_is_reached() -> None:

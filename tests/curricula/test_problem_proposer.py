@@ -1,4 +1,4 @@
-"""The Proposer that is rewarded for each problem, on Solvers whose best batch is known."""
+"""Proposers that are rewarded for each problem: by first-order gain, and PAIRED's regret."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from proposer_rl import methods, models
 from proposer_rl.curricula import (
     Curriculum,
     Filtered,
     FirstOrderProposer,
 )
-from proposer_rl.learning import DivergedError, PPOSettings
-from proposer_rl.models import (
-    ProblemHead,
-    ProposerNetwork,
-    categorical,
-    draw_at,
-    proposer_actor_critic,
-)
+from proposer_rl.learning import DivergedError, PPOSettings, SolverSettings
+from proposer_rl.meta.assembly import ProposerSettings
+from proposer_rl.methods import Components
 from proposer_rl.models.actor_critic import ActorCritic
+from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
+from tests.curricula.living import TASK, live, solvers, student
+from tests.curricula.made import filtered, paired
 from tests.curricula.scripted import GivenScores
 from tests.curricula.test_first_order import BINS, P, Skills, taught
+from tests.tasks.gymnasium.toys import walk_task
+from tests.tiny import evaluate
 
 WANTED = [0.0, 0.0, 1.0, 0.0, 0.5, 0.0]
 
@@ -41,9 +42,9 @@ class Seen(Skills):
 
 def agent() -> ActorCritic:
     torch.manual_seed(0)
-    head = ProblemHead(8, P, BINS, hidden=16, bands=4)
-    network = ProposerNetwork(head, nn.Linear(3, 8), context=8, hidden=8)
-    return proposer_actor_critic(network, categorical)
+    head = models.ProblemHead(8, P, BINS, hidden=16, bands=4)
+    network = models.ProposerNetwork(head, nn.Linear(3, 8), context=8, hidden=8)
+    return models.proposer_actor_critic(network, models.categorical)
 
 
 def ppo(**settings: Any) -> PPOSettings:
@@ -58,7 +59,7 @@ def rewarded(*parts: Any) -> FirstOrderProposer:
     return FirstOrderProposer(*parts, probe_levels=2, target_levels=3, step=1.0, measure="return")
 
 
-def filtered(curriculum: Curriculum, times: int) -> Curriculum:
+def the_last_of(curriculum: Curriculum, times: int) -> Curriculum:
     """Trains on one in so many levels: those with the highest scores, which are the last."""
     scores = GivenScores(torch.arange(float(times * P)))
     return curriculum if times == 1 else Filtered(curriculum, scores, times=times, temperature=1e-3)
@@ -73,7 +74,7 @@ def step_by_hand(expected: ActorCritic, streams: Streams, times: int, kept: slic
     seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
     policy = torch.distributions.Categorical(logits=expected(seen)["logits"][0])
     noise = torch.rand(times, 1, P, generator=streams.generator("choices"))
-    choices = draw_at(policy, noise)[kept]  # [times, 1, P]
+    choices = models.draw_at(policy, noise)[kept]  # [times, 1, P]
     paid = torch.tensor(WANTED)[choices]  # up to a factor, which standardising takes out
     advantage = (paid - paid.mean()) / paid.std()
     loss = -(advantage * policy.log_prob(choices)).mean() - 0.3 * policy.entropy().mean()
@@ -119,7 +120,7 @@ def test_every_problem_is_credited_with_its_own_alignment(times: int) -> None:
     task = Seen(WANTED)
     curriculum = proposer(task, epochs=1, entropy_coeff=0.3, max_grad_norm=100.0)
     expected, student = copy.deepcopy(curriculum.agent), taught(task)
-    batch = filtered(curriculum, times).propose(student, P, Streams(0))
+    batch = the_last_of(curriculum, times).propose(student, P, Streams(0))
     assert student.evaluations == 3 + 2 * P * times
     last = step_by_hand(expected, Streams(0), times, slice(None))
     assert sorted(batch.levels.tolist()) == sorted(last.tolist())
@@ -150,3 +151,48 @@ def test_a_proposer_that_has_not_begun_resumes_too() -> None:
     assert one.log() == {}
     levels = [c.propose(taught(task), P, Streams(0)).levels for c in (one, other)]
     assert torch.equal(*levels)
+
+
+MAZES = TASK.batch_size
+
+
+def test_equal_students_have_no_regret() -> None:
+    curriculum = paired(Streams(0, "solver"))  # the protagonist's own
+    levels = TASK.space.sample(MAZES, torch.Generator().manual_seed(0))
+    regret, metrics = curriculum.reward(student(0), levels, Streams(0))
+    assert (regret == 0).all() and metrics["regret"] == 0
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_the_reward_is_what_the_antagonist_gets_more(times: int) -> None:
+    curriculum, learner = paired(), solvers([0])
+    antagonist = TASK.learner([Streams(0, "antagonist")]).agent
+    levels = TASK.space.sample(MAZES, torch.Generator().manual_seed(2))
+    regret, _ = curriculum.reward(student(0), levels, Streams(0))
+    other, own = (evaluate(agent, levels)["return"][0] for agent in (antagonist, learner.agent))
+    torch.testing.assert_close(regret, (other - own).clamp_min(0))
+    assert float(regret.max()) > 0
+    whole = curriculum if times == 1 else filtered(curriculum, times=times)
+    (lived,) = live([whole], learner, [0], range(4))
+    # Both students on all that is drawn; the antagonist trains on what the protagonist trained on.
+    assert lived.frames == [MAZES * 8] * 4
+    assert lived.evaluations == [2 * times * MAZES + (times > 1) * times * MAZES] * 4
+    assert int(torch.tensor(lived.told[-1]["histogram"]).sum()) == 3 * MAZES
+
+
+def test_the_antagonist_trains_on_the_same_levels_with_its_own_chance() -> None:
+    curriculum, learner = paired(), solvers([0])
+    plain = TASK.learner([Streams(0, "antagonist")])
+    (lived,) = live([curriculum], learner, [0], range(2))
+    for number, levels in enumerate(lived.levels):
+        plain.env.set_levels(levels.unsqueeze(0))
+        plain.update([Streams(0, "update", number).generator("antagonist")])
+    assert (plain.snapshot()[0] == curriculum.antagonist.snapshot()).all()
+
+
+def test_it_has_no_second_solver_whose_episodes_go_on() -> None:
+    ppo = PPOSettings(horizon=8, continue_episodes=True)
+    task = walk_task(solver=SolverSettings(batch_size=MAZES, ppo=ppo))
+    components = Components(task, ProposerSettings(), 0)
+    with pytest.raises(ArgumentError, match=r"^continue_episodes=True: the second Solver"):
+        methods.paired(components)

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from proposer_rl.curricula.progress import LearningProgressCurriculum
 from proposer_rl.streams import Streams
-from proposer_rl.task import NoSuccessError
 from tests.curricula.scripted import Scripted, reached, step
 
 N = 4
@@ -45,12 +44,6 @@ def test_shares_follow_the_distance_of_two_averages(measure: str) -> None:
         progress[n] = abs(fast - slow)
     expected = 0.7 * progress / progress.sum() + 0.3 / N
     torch.testing.assert_close(curriculum.shares(), expected, rtol=1e-4, atol=1e-6)
-
-
-def test_a_first_look_shows_no_progress_and_all_bins_are_alike() -> None:
-    task = Scripted(torch.tensor([0.1, 0.9, 0.4, 0.0]), batch_size=8)
-    curriculum = LearningProgressCurriculum(task.space)
-    assert step(curriculum, task, 0).bincount(minlength=N).tolist() == [2] * N
 
 
 @pytest.mark.parametrize("source", ["exact", "episodes"])
@@ -124,13 +117,3 @@ def test_episodes_are_the_first_ones_since_the_last_look() -> None:
         curriculum.observe(task, batch, reached(torch.rand(3), solved))
     assert task.measured == []
     assert len(averages) == N
-
-
-def test_a_task_without_success_is_told_what_to_give() -> None:
-    task = Scripted(torch.rand(N), told="return")
-    with pytest.raises(
-        NoSuccessError, match=r"this task tells no success.*measure=return"
-    ) as error:
-        step(LearningProgressCurriculum(task.space), task, 0)
-    assert error.value.exit_code == 2
-    step(LearningProgressCurriculum(task.space, measure="return"), task, 0)

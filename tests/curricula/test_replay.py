@@ -1,15 +1,17 @@
-"""PLR, robust PLR, ACCEL, NCC and replay by regret: what is trained on, scored, kept and paid."""
+"""PLR, robust PLR, ACCEL, NCC, SFL and replay by regret: what is trained on, scored and kept."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict
 
-from proposer_rl.curricula import ReplayCurriculum, Scorer, Student, TaskStudent, outcome_of
+from proposer_rl import curricula as c
 from proposer_rl.curricula.buffer import (
     ReplayRule,
     empty_buffer,
@@ -22,18 +24,33 @@ from proposer_rl.curricula.scores import unseen
 from proposer_rl.learning import PPO, DivergedError
 from proposer_rl.streams import Streams
 from tests.curricula.living import TASK, live, solvers, student
-from tests.curricula.made import MADE, ncc, replay
+from tests.curricula.made import MADE, ncc, replay, selection
+from tests.curricula.scripted import GivenScores
 from tests.tiny import evaluate
 
 P, T = 4, 8
 
 
-def robust(**options: Any) -> ReplayCurriculum:
-    return replay(synchronous=False, **options)
+robust, accel = partial(replay, synchronous=False), partial(replay, edits=3)
+streams_of = partial(Streams, 0, "update")
+B = P * T  # frames of a batch
+
+COSTS: dict[str, tuple[Callable[[], c.Curriculum], list[int], list[int]]] = {
+    "one batch is scored beside every update": (replay, [2 * B, B, B, B], [0] * 4),
+    "and one of children": (accel, [2 * B, 2 * B, 2 * B, 2 * B], [0] * 4),
+    "new ones, and those trained on": (lambda: replay("regret", "exact"), [0] * 4, [2 * P] * 4),
+    "all are renewed": (ncc, [0] * 3, [2 * P + 16, P + 16, P + 16]),
+    "candidates": (selection, [0] * 5, [16, 0, 0, 16, 0]),
+    "played candidates": (lambda: selection("episodes"), [32 * T, 0, 0, 32 * T], [0] * 4),
+}
 
 
-def accel(**options: Any) -> ReplayCurriculum:
-    return replay(edits=3, **options)
+@pytest.mark.parametrize(("make", "frames", "evaluations"), COSTS.values(), ids=COSTS)
+def test_scores_cost_what_is_played_or_evaluated(
+    make: Callable[[], c.Curriculum], frames: list[int], evaluations: list[int]
+) -> None:
+    (lived,) = live([make()], solvers([0]), [0], range(len(frames)))
+    assert (lived.frames, lived.evaluations) == (frames, evaluations)
 
 
 @pytest.mark.parametrize("name", ["plr", "plr of regret", "plr of regret, renewed"])
@@ -56,40 +73,21 @@ def test_plr_trains_on_new_levels_and_on_old_ones(name: str) -> None:
             assert told["distinct_levels"] == len(level_keys(levels).unique())
 
 
-def streams_of(number: int) -> Streams:
-    return Streams(0, "update", number)
-
-
 def test_robust_plr_trains_on_replayed_levels_alone() -> None:
     curriculum, learner = robust(), solvers([0])
     frames = []
     for number in range(8):
-        taught = TaskStudent(TASK, learner)
+        taught = c.TaskStudent(TASK, learner)
         batch = curriculum.propose(taught, P, streams_of(number))
         known = set(curriculum.buffer["key"][curriculum.buffer["filled"]].tolist())
         assert set(level_keys(batch.levels).tolist()) <= known
         frames.append(taught.frames)
         learner.env.set_levels(batch.levels.unsqueeze(0))
         update = learner.update([streams_of(number).generator("actions")])
-        curriculum.observe(taught, batch, outcome_of(update.rollout[0]))
+        curriculum.observe(taught, batch, c.outcome_of(update.rollout[0]))
     assert frames[0] >= 2 * P * T and all(cost % (P * T) == 0 for cost in frames)
     assert sum(frames) == T * curriculum.state_dict()["scored"]  # each new level is played once
     assert 0 in frames[1:] and max(frames[1:]) > 0  # q = 0.6
-
-
-def test_the_synchronous_form_scores_one_batch_beside_every_update() -> None:
-    (lived,) = live([replay()], solvers([0]), [0], range(5))
-    frames = lived.frames
-    assert frames == [2 * P * T, *[P * T] * 4]
-    (lived,) = live([accel()], solvers([0]), [0], range(5))
-    frames = lived.frames
-    assert frames == [2 * P * T, *[2 * P * T] * 4]  # ... and one of children
-
-
-def test_what_is_exact_costs_evaluations_and_no_frames() -> None:
-    (lived,) = live([replay("regret", "exact")], solvers([0]), [0], range(4))
-    assert set(lived.frames) == {0}
-    assert lived.evaluations == [2 * P, *[2 * P] * 3]  # new ones, and those trained on before
 
 
 def test_exact_scores_are_of_the_solver_as_it_is_then() -> None:
@@ -99,7 +97,7 @@ def test_exact_scores_are_of_the_solver_as_it_is_then() -> None:
         live([curriculum], learner, [0], range(number, number + 1))
         (evidence,) = (curriculum.log(), curriculum.state_dict()["due"])[1]
         slots, keys = evidence["slot"], evidence["key"]
-        curriculum.propose(TaskStudent(TASK, learner), P, streams_of(99))
+        curriculum.propose(c.TaskStudent(TASK, learner), P, streams_of(99))
         there = curriculum.buffer["key"][slots] == keys  # unless a new one took its place
         levels = curriculum.buffer["level"]
         regret = TASK.optimal_return(levels) - evaluate(learner.agent, levels)["return"][0]
@@ -119,7 +117,7 @@ def test_new_levels_without_a_critic_are_compared_with_what_was_reached_elsewher
     def play(levels: Any, generator: Any) -> TensorDict:
         return TensorDict({"return": torch.full(levels.shape, reached)}, levels.shape)
 
-    curriculum, taught = replay("l1_value_loss", capacity=8), Student(play=play)
+    curriculum, taught = replay("l1_value_loss", capacity=8), c.Student(play=play)
     for number in range(4):
         batch = curriculum.propose(taught, P, streams_of(number))
         curriculum.observe(taught, batch, TensorDict({"return": torch.full((P,), 0.5)}, [P]))
@@ -177,10 +175,10 @@ def test_the_lineage_is_the_longest_line_of_edits() -> None:
 def test_easy_parents_are_those_of_the_lowest_return_minus_loss() -> None:
     learner = solvers([0])
     (lived,) = live([replay()], learner, [0], range(1))
-    rollout, taught = lived.rollouts[-1], TaskStudent(TASK, learner)
-    loss = Scorer("l1_value_loss", "episodes")
+    rollout, taught = lived.rollouts[-1], c.TaskStudent(TASK, learner)
+    loss = c.Scorer("l1_value_loss", "episodes")
     lost = loss.of_rollouts(taught, [rollout], unseen(P)).score
-    easy = easiness(taught, outcome_of(rollout))
+    easy = easiness(taught, c.outcome_of(rollout))
     after = rollout["next"]
     for p in range(P):
         total, count, reached = 0.0, 0, 0.0
@@ -197,9 +195,8 @@ def test_the_distribution_of_ncc_is_a_softmax_over_renewed_scores() -> None:
     found = score_weights(score, score >= 0, rule).float()
     torch.testing.assert_close(found, torch.tensor([0.853216, 0.141036, 0.005749]))
     curriculum, learner = ncc(), solvers([0])
-    (lived,) = live([curriculum], learner, [0], range(3))
-    assert lived.evaluations == [2 * P + 16, P + 16, P + 16]
-    curriculum.propose(TaskStudent(TASK, learner), P, streams_of(3))
+    live([curriculum], learner, [0], range(3))
+    curriculum.propose(c.TaskStudent(TASK, learner), P, streams_of(3))
     filled = curriculum.buffer["filled"]
     chance = evaluate(learner.agent, curriculum.buffer["level"])["success"][0]
     expected = (chance * (1 - chance))[filled].double()
@@ -234,11 +231,11 @@ def credited() -> list[Any]:
     )
     seen = []
     for number, count in enumerate(SIZES):
-        batch = curriculum.propose(Student(), count, Streams(0, number))
+        batch = curriculum.propose(c.Student(), count, Streams(0, number))
         score = torch.rand(count, generator=Streams(0, number).generator("score"))
         before = curriculum.buffer["score"].clone()
         outcome = TensorDict({"return": torch.zeros_like(score), "score": score}, [count])
-        curriculum.observe(Student(), batch, outcome)
+        curriculum.observe(c.Student(), batch, outcome)
         seen.append((batch, score.double(), before, curriculum.buffer["score"].clone()))
     return seen
 
@@ -276,8 +273,8 @@ def test_levels_with_nested_entries_are_restored() -> None:
             numbers = torch.rand(count, 3, generator=generator)
             return TensorDict({"wall": {"height": numbers}, "goal": numbers[:, 0]}, [count])
 
-    def made() -> ReplayCurriculum:
-        return ReplayCurriculum(Nested(), Scorer("regret", "exact"), capacity=4)
+    def made() -> c.ReplayCurriculum:
+        return c.ReplayCurriculum(Nested(), c.Scorer("regret", "exact"), capacity=4)
 
     curriculum, again = made(), made()
     curriculum.buffer = empty_buffer(Nested().sample(1, torch.Generator())[0], 4)
@@ -295,3 +292,45 @@ def test_where_no_episode_ends_new_levels_are_trained_on_and_none_is_replayed() 
     for curriculum in (robust(), replay(train_on_new=True, replay_probability=1.0)):
         with pytest.raises(DivergedError, match=r"on none of 8 new levels did an episode end"):
             live([curriculum], learner, [0], range(4))
+
+
+def test_the_best_are_kept_and_half_of_a_batch_is_drawn_from_them() -> None:
+    curriculum, learner, stream = selection(), solvers([0]), Streams(0, "update", 0)
+    taught = c.TaskStudent(TASK, learner)
+    levels = curriculum.propose(taught, P, stream)
+    candidates = TASK.space.sample(16, stream.generator("candidates"))
+    chance = evaluate(learner.agent, candidates)["success"][0]
+    worth = [float(p * (1 - p)) for p in chance]
+    best = sorted(range(16), key=lambda i: -worth[i])[:6]
+    keys = level_keys(candidates)
+    assert level_keys(curriculum.kept).tolist() == keys[best].tolist()
+    drawn = level_keys(levels).tolist()
+    assert all(key in keys[best].tolist() for key in drawn[:2])
+    told = curriculum.log()
+    assert told["highest_score"] >= told["mean_score"] >= told["lowest_kept_score"]
+    assert level_keys(told["levels"]["highest scores"]).tolist() == keys[best].tolist()
+
+
+def test_the_best_that_have_a_score_are_kept() -> None:
+    """Levels without one, as where no episode ends within the horizon, are not trained on."""
+    curriculum, few = selection(keep=3), torch.full((16,), -torch.inf)
+    found = torch.tensor([0.0, 0.25, 0.0, 0.2, 0.0, -torch.inf, 0.1] + [0.0] * 9)
+    curriculum.scorer = GivenScores(found)
+    curriculum.propose(student(0), P, Streams(0))
+    assert curriculum.scores.tolist() == pytest.approx([0.25, 0.2, 0.1])
+    few[:2] = 0.1
+    curriculum = selection(keep=3)
+    curriculum.scorer = GivenScores(few)
+    with pytest.raises(DivergedError, match=r"on 2 of 16 .* fewer than 3 have"):
+        curriculum.propose(student(0), P, Streams(0))
+
+
+@pytest.mark.parametrize(("new", "fresh"), [(0.0, 0), (1.0, 4), (0.25, 1)])
+def test_the_mixture_is_exact(new: float, fresh: int) -> None:
+    curriculum = selection(new=new)
+    keys = level_keys(curriculum.propose(student(0), P, Streams(0)))
+    kept = torch.isin(keys, level_keys(curriculum.kept))
+    assert bool(kept[: P - fresh].all()) and len(keys) == P
+    if fresh:
+        drawn = level_keys(TASK.space.sample(fresh, Streams(0).generator("levels")))
+        assert torch.equal(keys[P - fresh :], drawn)

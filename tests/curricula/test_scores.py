@@ -15,8 +15,6 @@ from proposer_rl.curricula import Student, TaskStudent, outcome_of
 from proposer_rl.curricula.scores import STEPWISE, Scorer, episodes, unseen
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
-from proposer_rl.task import NoSuccessError
-from tests.curricula.scripted import Scripted
 from tests.tiny import TASK, evaluate, learners
 
 LEARNER = Student(gamma=0.9, lmbda=0.5)
@@ -226,13 +224,6 @@ def test_learnability_is_of_the_share_that_a_loop_tells_and_scores_are_its_own()
     assert float(found.best) == 0.5
     outcome["score"] = torch.tensor([7.0])
     assert float(Scorer("max_mc", "episodes").of_outcome(LEARNER, outcome, *known).score) == 7
-
-
-def test_learnability_needs_a_task_that_tells_success() -> None:
-    blind = Scripted(torch.rand(3), told="return")
-    with pytest.raises(NoSuccessError, match="this task tells no success, only the return") as no:
-        Scorer("learnability", "exact")(blind, torch.tensor([0, 1]), Streams(0))
-    assert no.value.exit_code == 2
 
 
 def shortfall(student: Student, outcome: TensorDictBase) -> Tensor:

@@ -11,22 +11,15 @@ from scipy.stats import kstest, truncnorm
 
 import proposer_rl as prl
 from proposer_rl.curricula import SelfPacedCurriculum
-from proposer_rl.curricula.self_paced import (
-    Floats,
-    Gaussian,
-    divergence,
-    draw_in_box,
-    expected_performance,
-    step_towards,
-)
+from proposer_rl.curricula import self_paced as spdl
 from proposer_rl.tasks.parameters import ParameterSpace, intervals, points
 from tests.curricula.scripted import Scripted, step
 
-NOW, TARGET = (Gaussian(np.array([m]), np.array([s])) for m, s in ((-0.2, 0.3), (0.8, 0.02)))
+NOW, TARGET = (spdl.Gaussian(np.array([m]), np.array([s])) for m, s in ((-0.2, 0.3), (0.8, 0.02)))
 EPSILON, LEAST = 0.1, 0.01
 
 
-def episodes(seed: int, middle: float) -> tuple[Floats, Floats, Floats]:
+def episodes(seed: int, middle: float) -> tuple[spdl.Floats, spdl.Floats, spdl.Floats]:
     """Those of a student that succeeds below a place, drawn from the present Gaussian."""
     noise = np.random.default_rng(seed)
     places = truncnorm.rvs(-0.8 / 0.3, 1.2 / 0.3, -0.2, 0.3, size=(60, 1), random_state=noise)
@@ -35,14 +28,16 @@ def episodes(seed: int, middle: float) -> tuple[Floats, Floats, Floats]:
     return places, density, solved.astype(float)
 
 
-def on_a_grid(seen: tuple[Floats, Floats, Floats], delta: float) -> tuple[float, float]:
+def on_a_grid(
+    seen: tuple[spdl.Floats, spdl.Floats, spdl.Floats], delta: float
+) -> tuple[float, float]:
     """Divergence from the target and expected performance of the best of all Gaussians near NOW."""
     means, deviations = np.meshgrid(np.linspace(-1, 1, 801), np.geomspace(LEAST, 2, 400))
     places, density, solved = seen
 
-    def apart(other: Gaussian) -> Floats:
+    def apart(other: spdl.Gaussian) -> spdl.Floats:
         ratio, away = deviations / other.deviation, (means - other.mean) / other.deviation
-        found: Floats = (ratio**2 + away**2 - 1) / 2 - np.log(ratio)
+        found: spdl.Floats = (ratio**2 + away**2 - 1) / 2 - np.log(ratio)
         return found
 
     near = apart(NOW) <= EPSILON
@@ -63,27 +58,27 @@ def on_a_grid(seen: tuple[Floats, Floats, Floats], delta: float) -> tuple[float,
 def test_a_step_is_the_best_on_a_grid(seed: int, delta: float, middle: float) -> None:
     seen = episodes(seed, middle)
     left, performance = on_a_grid(seen, delta)
-    new, expected = step_towards(TARGET, NOW, *seen, delta, EPSILON, LEAST)
-    assert divergence(new, NOW)[0] <= EPSILON + 1e-3
-    assert expected == pytest.approx(expected_performance(new, *seen)[0])
+    new, expected = spdl.step_towards(TARGET, NOW, *seen, delta, EPSILON, LEAST)
+    assert spdl.divergence(new, NOW)[0] <= EPSILON + 1e-3
+    assert expected == pytest.approx(spdl.expected_performance(new, *seen)[0])
     if performance >= delta:
         assert expected >= delta - 1e-3
-        assert divergence(new, TARGET)[0] <= 1.01 * left
+        assert spdl.divergence(new, TARGET)[0] <= 1.01 * left
     else:
         assert expected >= performance - 2e-3
 
 
 def test_gradients_are_those_of_differences() -> None:
     noise = np.random.default_rng(0)
-    at, other = noise.normal(size=6), Gaussian(noise.normal(size=3), noise.uniform(0.5, 1, 3))
+    at, other = noise.normal(size=6), spdl.Gaussian(noise.normal(size=3), noise.uniform(0.5, 1, 3))
     seen = noise.normal(size=(9, 3)), noise.normal(size=9), noise.normal(size=9)
 
-    def gaussian(x: Floats) -> Gaussian:
-        return Gaussian(x[:3], np.exp(x[3:]))
+    def gaussian(x: spdl.Floats) -> spdl.Gaussian:
+        return spdl.Gaussian(x[:3], np.exp(x[3:]))
 
     for value in (
-        lambda x: divergence(gaussian(x), other),
-        lambda x: expected_performance(gaussian(x), *seen),
+        lambda x: spdl.divergence(gaussian(x), other),
+        lambda x: spdl.expected_performance(gaussian(x), *seen),
     ):
         steps = 1e-6 * np.eye(6)
         slopes = [(value(at + s)[0] - value(at - s)[0]) / 2e-6 for s in steps]
@@ -93,7 +88,7 @@ def test_gradients_are_those_of_differences() -> None:
 def test_draws_are_those_of_a_gaussian_within_the_box() -> None:
     mean, deviation = torch.tensor([0.9, -1.0]).double(), torch.tensor([0.5, 0.1]).double()
     shares = torch.rand(2000, 2, generator=torch.Generator().manual_seed(0)).double()
-    places, density = draw_in_box(mean, deviation, shares)
+    places, density = spdl.draw_in_box(mean, deviation, shares)
     expected = np.zeros(2000)
     for axis in range(2):
         at, wide = float(mean[axis]), float(deviation[axis])

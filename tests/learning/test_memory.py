@@ -67,26 +67,6 @@ def test_values_after_a_step_are_those_before_the_next_one() -> None:
     assert not torch.allclose(before[truncated], after[truncated], atol=1e-4)
 
 
-@pytest.mark.parametrize("how", [{}, {"batched": True}], ids=["one by one", "batched"])
-def test_copies_together_learn_what_each_learns_alone(how: dict[str, Any]) -> None:
-    together = learner(**how)
-    rollouts = [together.update(generators(*range(K))).rollout for _ in range(2)]
-    for k in range(K):
-        copy = range(k, k + 1)
-        alone = learner(copy)
-        for rollout in rollouts:
-            own = alone.update(generators(*copy)).rollout
-            assert torch.equal(own["action"][0], rollout["action"][k])
-            torch.testing.assert_close(
-                own["advantage"][0], rollout["advantage"][k], rtol=1e-4, atol=1e-5
-            )
-        one, both = alone.snapshot(), together.snapshot()
-        for name in one.keys():
-            torch.testing.assert_close(
-                one[name, "value"][0], both[name, "value"][k], rtol=1e-4, atol=1e-5
-            )
-
-
 def test_a_second_look_at_a_rollout_remembers_with_the_present_weights() -> None:
     ppo = learner()
     rollout = ppo.collect(generators(*range(K)))

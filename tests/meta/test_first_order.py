@@ -1,31 +1,27 @@
-"""First-order gain against derivatives that are taken in other ways."""
+"""First-order gain and lengths of gradients against derivatives that are taken in other ways."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from itertools import product
 
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torch.nn.functional import unfold
 
 from proposer_rl.learning import PPO, DivergedError, PPOSettings, gae
-from proposer_rl.meta.first_order import (
-    alignment,
-    bin_scores,
-    moved_along,
-    root_mean_square,
-    surrogate,
-    target_direction,
-    target_performance,
-)
+from proposer_rl.meta import first_order
+from proposer_rl.meta import first_order as fo
 from proposer_rl.models import ActorCritic, Population, UNet, categorical
 from proposer_rl.models.grids import cell_logits, read_maps
+from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import Level, MazeEnv, generate_levels, planes
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
+from tests.tiny import TASK
 
 EVALUATE = ExactEvaluator(max_steps=8)
 RATE = 1e-3
@@ -80,12 +76,14 @@ def performance(agent: ActorCritic, levels: Level) -> TensorDict:
 
 
 def exact_direction(ppo: PPO, levels: Level, measure: str = "log_success") -> dict[str, Tensor]:
-    return target_direction(ppo, target_performance(performance(ppo.agent, levels), measure))
+    return fo.target_direction(ppo, fo.target_performance(performance(ppo.agent, levels), measure))
 
 
 def aligned(ppo: PPO, direction: dict[str, Tensor], levels: Level, step: float = RATE) -> Tensor:
     """The slope of the exact return of levels [K, E] along a direction, by differences."""
-    return alignment(ppo.agent, direction, step, lambda: performance(ppo.agent, levels)["return"])
+    return fo.alignment(
+        ppo.agent, direction, step, lambda: performance(ppo.agent, levels)["return"]
+    )
 
 
 def inner(one: dict[str, Tensor], other: dict[str, Tensor]) -> Tensor:
@@ -102,7 +100,7 @@ def central_differences(
             for change in (1e-6, -1e-6):
                 one = {n: torch.zeros_like(p) for n, p in agent.named_parameters()}
                 one[name].flatten(1)[:, i] = change
-                with torch.no_grad(), moved_along(agent, one, 1.0):
+                with torch.no_grad(), fo.moved_along(agent, one, 1.0):
                     values.append(value())
             yield name, i, (values[0] - values[1]) / 2e-6
 
@@ -164,7 +162,7 @@ def test_before_the_first_step_it_is_the_gradients_direction() -> None:
     found = exact_direction(ppo, levels, "return")
     value = performance(ppo.agent, levels)["return"].mean(1).sum()
     slope = gradient(ppo.agent, value)
-    torch.testing.assert_close(root_mean_square(found), torch.ones(2, dtype=torch.float64))
+    torch.testing.assert_close(fo.root_mean_square(found), torch.ones(2, dtype=torch.float64))
     cosine = inner(found, slope) / (inner(found, found) * inner(slope, slope)).sqrt()
     torch.testing.assert_close(cosine, torch.ones(2, dtype=torch.float64))
 
@@ -177,11 +175,11 @@ def test_an_alignment_tells_what_a_small_step_changes() -> None:
     def returns() -> Tensor:
         return performance(ppo.agent, levels)["return"]
 
-    slope = alignment(ppo.agent, direction, RATE, returns)
+    slope = fo.alignment(ppo.agent, direction, RATE, returns)
     before = returns().detach()
     remainder = []
     for step in (1e-3, 1e-4):
-        with torch.no_grad(), moved_along(ppo.agent, direction, step):
+        with torch.no_grad(), fo.moved_along(ppo.agent, direction, step):
             remainder.append((returns() - before - step * slope).abs().max())
     assert remainder[0] < 0.01 * (1e-3 * slope).abs().max()
     # Of second order: a tenth of the step leaves a hundredth of it.
@@ -229,21 +227,10 @@ def test_short_differences_tell_the_derivative_also_in_wide_networks(
     assert agreement(RATE) < agreement(RATE / 20)
 
 
-def test_a_solvers_numbers_do_not_depend_on_those_beside_it() -> None:
-    target, levels = some_levels(2, 5), some_levels(2, 4)
-    both, alone = learner(target), learner(target[1:], 1)
-    alone.restore(both.snapshot()[1:])
-
-    def scores(ppo: PPO, which: slice) -> Tensor:
-        return aligned(ppo, exact_direction(ppo, target[which]), levels[which])
-
-    torch.testing.assert_close(scores(both, slice(0, 2))[1:], scores(alone, slice(1, 2)))
-
-
 def ppo_advantages(ppo: PPO, rollout: TensorDict) -> Tensor:
     """What training weights log-probabilities with, float [K, P, T]: not standardised here."""
     assert not ppo.settings.normalize_advantage
-    estimate = gae(ppo.settings.gamma, ppo.settings.lmbda, ppo.agent.value_key)
+    estimate = gae(ppo.settings.gamma, ppo.settings.lmbda)
     return estimate(rollout.copy())["advantage"].squeeze(-1)
 
 
@@ -261,8 +248,8 @@ def test_sampled_quantities_come_nearer_to_the_exact_ones_with_more_episodes() -
     rollout, advantage = first_episodes(ppo, [torch.Generator().manual_seed(k) for k in range(2)])
     exact = exact_direction(ppo, levels, "return")
     expected = aligned(ppo, exact, levels)
-    each = steps * alignment(
-        ppo.agent, exact, RATE, lambda: surrogate(ppo.agent, rollout, advantage)
+    each = steps * fo.alignment(
+        ppo.agent, exact, RATE, lambda: fo.surrogate(ppo.agent, rollout, advantage)
     ).unflatten(1, (episodes, 6))
     error = {n: float((each[:, :n].mean(1) - expected).square().mean().sqrt()) for n in (32, 2048)}
     spread = float(each.std(1).square().mean().sqrt())
@@ -271,26 +258,13 @@ def test_sampled_quantities_come_nearer_to_the_exact_ones_with_more_episodes() -
     together = torch.stack([each.mean(1).flatten(), expected.flatten()])
     assert torch.corrcoef(together)[0, 1] > 0.98
 
-    sampled = target_direction(ppo, surrogate(ppo.agent, rollout, advantage).mean(1))
+    sampled = fo.target_direction(ppo, fo.surrogate(ppo.agent, rollout, advantage).mean(1))
     cosine = inner(sampled, exact) / (inner(sampled, sampled) * inner(exact, exact)).sqrt()
     few = rollout[:, : 6 * 32], advantage[:, : 6 * 32]
-    rough = target_direction(ppo, surrogate(ppo.agent, *few).mean(1))
+    rough = fo.target_direction(ppo, fo.surrogate(ppo.agent, *few).mean(1))
     cosine_of_few = inner(rough, exact) / (inner(rough, rough) * inner(exact, exact)).sqrt()
     assert (cosine > 0.95).all()
     assert (cosine_of_few < cosine).all()
-
-
-def test_alignments_of_problems_add_up_to_the_batchs() -> None:
-    levels = some_levels(2, 6)
-    ppo = learner(levels)
-    rollout = ppo.collect([torch.Generator().manual_seed(k) for k in range(2)])
-    advantage = ppo_advantages(ppo, rollout)
-    direction = exact_direction(ppo, levels)
-    each = alignment(ppo.agent, direction, 1e-4, lambda: surrogate(ppo.agent, rollout, advantage))
-    batch = surrogate(ppo.agent, rollout, advantage).mean(1).sum()
-    torch.testing.assert_close(
-        each.mean(1), inner(direction, gradient(ppo.agent, batch)), rtol=1e-4, atol=1e-9
-    )
 
 
 @pytest.mark.parametrize("fails", [False, True])
@@ -309,9 +283,9 @@ def test_moved_weights_come_back_bit_by_bit(fails: bool) -> None:
 
     if fails:
         with pytest.raises(KeyError):
-            alignment(ppo.agent, direction, 0.1, worth)
+            fo.alignment(ppo.agent, direction, 0.1, worth)
     else:
-        alignment(ppo.agent, direction, 0.1, worth)
+        fo.alignment(ppo.agent, direction, 0.1, worth)
     for name, parameter in ppo.agent.named_parameters():
         assert parameter.data_ptr() == places[name]  # still what Adam moves
         assert torch.equal(parameter.view(torch.int32), before[name].view(torch.int32))
@@ -325,26 +299,145 @@ def test_a_direction_that_is_none_is_an_error(factor: float, message: str) -> No
     ppo = learner(levels)
     returns = performance(ppo.agent, levels)["return"].mean(1)
     with pytest.raises(DivergedError, match=message):
-        target_direction(ppo, returns * torch.tensor([1.0, factor]))
+        fo.target_direction(ppo, returns * torch.tensor([1.0, factor]))
 
 
 def test_a_target_without_any_success_is_told_in_one_line() -> None:
     success = torch.tensor([[0.0, 1e-30], [0.0, 0.0]])
     told = "copy 1: the probability of success is exactly 0 on each of 2 levels"
     with pytest.raises(DivergedError, match=told) as info:
-        target_performance(TensorDict({"success": success}, [2, 2]), "log_success")
+        fo.target_performance(TensorDict({"success": success}, [2, 2]), "log_success")
     assert "\n" not in str(info.value)
-
-
-def test_success_that_a_task_does_not_tell_is_refused() -> None:
-    told = TensorDict({"return": torch.rand(1, 3)}, [1, 3])
-    with pytest.raises(ValueError, match="this task tells no success, only the return"):
-        target_performance(told, "log_success")
 
 
 def test_scores_are_means_with_standard_errors() -> None:
     values = torch.randn(2, 3, 16, generator=torch.Generator().manual_seed(0))
-    score, error = bin_scores(values)
+    score, error = fo.bin_scores(values)
     np.testing.assert_allclose(score, values.numpy().mean(-1), rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(error, values.numpy().std(-1, ddof=1) / 4, rtol=1e-5)
-    assert bin_scores(values[..., :1])[1].isinf().all()
+    assert fo.bin_scores(values[..., :1])[1].isinf().all()
+
+
+class Precise:
+    """Policies of a few numbers in double precision, as much of a task as is asked of one here."""
+
+    device = torch.device("cpu")
+
+    def learner(self, streams: Sequence[Streams]) -> PPO:
+        return learner(some_levels(len(streams), 1), len(streams))
+
+    def differentiable_performance(self, agent: ActorCritic, levels: Level) -> TensorDictBase:
+        return performance(agent, levels)
+
+
+def numerical(ppo: PPO, levels: Level) -> Tensor:
+    """Sums of squared central differences over every single parameter: float [K, n]."""
+    total = torch.zeros(levels.batch_size, dtype=torch.float64)
+    for *_, slope in central_differences(
+        ppo.agent, lambda: performance(ppo.agent, levels)["return"]
+    ):
+        total += slope.square()
+    return total
+
+
+def one_by_one(ppo: PPO, value: Callable[[], Tensor]) -> Tensor:
+    """|grad|^2 of each of the values [K, n], by a backward pass of its own and nothing else."""
+    found = torch.zeros(value().shape, dtype=value().dtype)
+    for k, i in product(*map(range, found.shape)):
+        ppo.agent.zero_grad()
+        value()[k, i].backward()
+        found[k, i] = sum(
+            p.grad.square().sum() for p in ppo.agent.parameters() if p.grad is not None
+        )
+    return found
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 8])
+def test_they_are_those_of_finite_differences(
+    at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(first_order, "LEVELS_AT_ONCE", at_once)
+    ppo, levels = learner(some_levels(2, 1)), some_levels(2, 4)
+    found = fo.LevelGradients(Precise()).of_returns(ppo, levels)
+    torch.testing.assert_close(found, numerical(ppo, levels), rtol=1e-6, atol=1e-12)
+    assert not found.requires_grad and (found[0] != found[1]).all()
+
+
+def test_they_are_those_of_single_levels_also_after_training() -> None:
+    ppo = TASK.learner([Streams(0), Streams(1)])
+    score = fo.LevelGradients(TASK).of_returns
+    levels = torch.stack([TASK.space.sample(5, Streams(k).generator()) for k in (0, 1)])
+    for _ in range(2):  # the same population serves Solvers that have changed
+        before = ppo.snapshot()
+        found = score(ppo, levels)
+        assert (ppo.snapshot() == before).all()
+        expected = one_by_one(
+            ppo, lambda: TASK.differentiable_performance(ppo.agent, levels)["return"]
+        )
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-9)
+        ppo.update([Streams(k).generator("actions") for k in (0, 1)])
+
+
+def test_those_of_episodes_are_of_single_policy_gradients() -> None:
+    ppo = TASK.learner([Streams(0), Streams(1)])
+    ppo.update([Streams(k).generator("first") for k in (0, 1)])  # a fresh policy is nearly even
+    rollout = ppo.collect([Streams(k).generator("actions") for k in (0, 1)])
+    advantage = torch.randn(rollout.shape, generator=torch.Generator().manual_seed(0))
+    found = fo.LevelGradients(TASK).of_rollouts(ppo, rollout, advantage)
+
+    def gained() -> Tensor:
+        steps = ppo.agent(rollout.exclude("next").clone())["logits"].log_softmax(-1)
+        taken = steps.gather(-1, rollout["action"].unsqueeze(-1)).squeeze(-1)
+        return (taken * advantage).mean(-1)
+
+    torch.testing.assert_close(found, one_by_one(ppo, gained), rtol=1e-3, atol=1e-9)
+
+
+def test_nothing_is_drawn_at_random() -> None:
+    ppo, levels = TASK.learner([Streams(0)]), TASK.space.sample(2, Streams(0).generator())[None]
+    torch.manual_seed(3)
+    expected = torch.rand(4)
+    torch.manual_seed(3)
+    fo.LevelGradients(TASK).of_returns(ppo, levels)
+    assert torch.equal(torch.rand(4), expected)
+
+
+def test_where_the_return_cannot_change_it_is_zero() -> None:
+    solvable, walled = "S..\n...\n..G", "S#.\n##.\n..G"
+    levels = Level.from_text([walled, solvable, walled]).reshape(1, 3)
+    found = fo.LevelGradients(Precise()).of_returns(learner(levels, 1), levels)
+    assert found[0, 0] == found[0, 2] == 0 < found[0, 1]
+
+
+def test_the_uniform_policy_next_to_the_goal_in_closed_form() -> None:
+    """With p = 1/4 to go right, J = 1 - (1 - p)^8 - 0.01 * sum over t < 8 of (1 - p)^t.
+
+    The slope towards the logit of action a is dJ/dp p (1[a = right] - p). A logit has a bias and
+    two weights whose inputs are 1: of the start here, and of the goal to the right.
+    """
+    levels = Level.from_text("SG").reshape(1, 1)
+    ppo = learner(levels, 1)
+    for parameter in ppo.agent.parameters():
+        parameter.data.zero_()
+    slope = 8 * 0.75**7 + 0.01 * sum(t * 0.75 ** (t - 1) for t in range(8))
+    expected = 3 * slope**2 * sum((0.25 * ((a == 3) - 0.25)) ** 2 for a in range(4))
+    found = fo.LevelGradients(Precise()).of_returns(ppo, levels)
+    assert found.item() == pytest.approx(expected, rel=1e-12)
+
+
+def test_frozen_parameters_add_nothing() -> None:
+    class Frozen(Precise):
+        """The same without their biases' training."""
+
+        def learner(self, streams: Sequence[Streams]) -> PPO:
+            ppo = super().learner(streams)
+            [*ppo.agent.parameters()][1].requires_grad_(False)
+            return ppo
+
+    levels = some_levels(2, 3)
+    found = fo.LevelGradients(Frozen()).of_returns(
+        ppo := Frozen().learner([Streams(0)] * 2), levels
+    )
+    expected = one_by_one(ppo, lambda: performance(ppo.agent, levels)["return"])
+    torch.testing.assert_close(found, expected)
+    assert (found < fo.LevelGradients(Precise()).of_returns(ppo, levels)).all()

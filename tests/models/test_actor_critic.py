@@ -9,17 +9,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch.distributions import Categorical, Normal
 
-from proposer_rl.models import (
-    Population,
-    UNet,
-    categorical,
-    cell_logits,
-    cell_maps,
-    draw_at,
-    joint_categorical,
-    map_actor_critic,
-    uniform_noise,
-)
+from proposer_rl import models
 from proposer_rl.models.grids import read_maps
 from tests.draws import generators
 
@@ -27,10 +17,10 @@ K, P, T, H, W = 2, 3, 5, 6, 7
 
 
 def solver(per_step: bool = False):
-    def make() -> UNet:
-        return UNet(in_channels=4 if per_step else 3, channels=(8, 16), groups=4)
+    def make() -> models.UNet:
+        return models.UNet(in_channels=4 if per_step else 3, channels=(8, 16), groups=4)
 
-    return map_actor_critic(Population(make, K), per_step=per_step)
+    return models.map_actor_critic(models.Population(make, K), per_step=per_step)
 
 
 def rollout(channels: int = 3) -> TensorDict:
@@ -39,25 +29,20 @@ def rollout(channels: int = 3) -> TensorDict:
     return TensorDict({"planes": planes, "agent": agent}, [K, P, T])
 
 
-def test_decoding_a_context_equals_a_pass_per_transition() -> None:
-    agent, steps = solver(), rollout()
+@pytest.mark.parametrize("per_step", [False, True])
+def test_decoding_a_context_equals_a_pass_per_transition(per_step: bool) -> None:
+    agent, steps = solver(per_step), rollout(4 if per_step else 3)
+    assert bool(agent.level_keys) != per_step  # where each step has its own, nothing is shared
     slow = agent(steps.clone())
-    fast = agent.decode(steps.select("agent"), agent.encode(steps[..., 0]))
+    shown = steps.clone() if per_step else steps.select("agent")
+    fast = agent.decode(shown, agent.encode(steps[..., 0]))
     assert fast["logits"].shape == (K, P, T, 4)
     for key in ("logits", "state_value"):
         torch.testing.assert_close(fast[key], slow[key], rtol=1e-4, atol=1e-5)
 
 
-def test_without_an_encoder_decoding_is_a_pass_per_transition() -> None:
-    agent, steps = solver(per_step=True), rollout(4)
-    assert agent.level_keys == []
-    slow = agent(steps.clone())
-    fast = agent.decode(steps.clone(), agent.encode(steps[..., 0]))
-    assert torch.equal(fast["logits"], slow["logits"])
-
-
 def test_a_network_without_copies_is_an_ordinary_actor() -> None:
-    agent = map_actor_critic(UNet(channels=(8, 16), groups=4))
+    agent = models.map_actor_critic(models.UNet(channels=(8, 16), groups=4))
     assert agent.copies is None
     step = rollout()[0, :, 0]
     result = agent.actor()(step)
@@ -82,8 +67,14 @@ def test_read_maps_indexes_the_agents_cell(extra: tuple[int, ...]) -> None:
 def test_cell_maps_are_what_the_solver_says_at_each_cell(per_step: bool) -> None:
     agent = solver(per_step)
     planes = torch.rand(K, P, 3, H, W)
-    logits, values = cell_maps(agent, planes)
-    assert torch.equal(cell_logits(agent, planes), logits) and values.shape == (K, P, 1, H, W)
+    logits, values = models.cell_maps(agent, planes)
+    assert torch.equal(models.cell_logits(agent, planes), logits) and values.shape == (
+        K,
+        P,
+        1,
+        H,
+        W,
+    )
     for row, column in [(0, 0), (2, 5), (H - 1, W - 1)]:
         shown = planes
         if per_step:
@@ -101,8 +92,8 @@ def test_cell_maps_are_what_the_solver_says_at_each_cell(per_step: bool) -> None
     st.floats(0, 1, exclude_max=True, width=32),
 )
 def test_draw_inverts_the_cumulative_distribution(logits: list[float], uniform: float) -> None:
-    distribution = categorical(torch.tensor(logits, dtype=torch.float64))
-    action = int(draw_at(distribution, torch.tensor(uniform, dtype=torch.float64)))
+    distribution = models.categorical(torch.tensor(logits, dtype=torch.float64))
+    action = int(models.draw_at(distribution, torch.tensor(uniform, dtype=torch.float64)))
     cumulative = distribution.probs.cumsum(0)
     below = float(cumulative[action - 1]) if action else 0.0
     assert below <= uniform + 1e-12 and uniform <= float(cumulative[action]) + 1e-12
@@ -111,21 +102,24 @@ def test_draw_inverts_the_cumulative_distribution(logits: list[float], uniform: 
 def test_draw_never_takes_an_impossible_action() -> None:
     probabilities = torch.tensor([0.0, 0.5, 0.0, 0.5, 0.0])
     edges = torch.tensor([0.0, 0.25, 0.5, 1 - 2**-24])
-    actions = draw_at(Categorical(probs=probabilities.expand(4, 5)), edges)
+    actions = models.draw_at(Categorical(probs=probabilities.expand(4, 5)), edges)
     assert actions.tolist() == [1, 1, 3, 3]
 
 
 def test_draw_sees_through_independence_and_takes_other_distributions() -> None:
     logits, noise = torch.randn(3, 5, 4), torch.rand(3, 5)
     assert torch.equal(
-        draw_at(joint_categorical(logits), noise), draw_at(categorical(logits), noise)
+        models.draw_at(models.joint_categorical(logits), noise),
+        models.draw_at(models.categorical(logits), noise),
     )
-    assert draw_at(Normal(torch.zeros(1), 1.0), torch.tensor([0.5])).item() == pytest.approx(0.0)
+    assert models.draw_at(Normal(torch.zeros(1), 1.0), torch.tensor([0.5])).item() == pytest.approx(
+        0.0
+    )
 
 
 def test_noise_of_a_copy_depends_on_its_generator_alone() -> None:
     device = torch.device("cpu")
-    both = uniform_noise(torch.Size([2, 3]), 4, generators(5, 6), device)
-    alone = uniform_noise(torch.Size([1, 3]), 4, generators(6), device)
+    both = models.uniform_noise(torch.Size([2, 3]), 4, generators(5, 6), device)
+    alone = models.uniform_noise(torch.Size([1, 3]), 4, generators(6), device)
     assert both.shape == (4, 2, 3)
     assert torch.equal(both[:, 1:], alone)

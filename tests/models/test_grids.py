@@ -58,12 +58,6 @@ def test_copies_can_take_the_product_all_at_once() -> None:
         torch.testing.assert_close(one, other)
 
 
-def test_in_float32_it_is_pytorchs_own() -> None:
-    layer, maps = Conv3x3(8, 16), torch.randn(4, 8, 2, 2)
-    expected = F.conv2d(maps, layer.weight, layer.bias, padding=1)
-    assert torch.equal(layer(maps), expected)
-
-
 @pytest.mark.parametrize(("height", "width"), [(10, 10), (4, 4), (13, 7), (21, 21), (99, 80)])
 def test_maps_have_the_resolution_of_the_input(height: int, width: int) -> None:
     policy, value = UNet(channels=(8, 16, 16), groups=4)(torch.rand(2, 3, height, width))

@@ -15,10 +15,10 @@ import pytest
 
 from proposer_rl.report import reading
 from proposer_rl.report.figures import draw_run
+from proposer_rl.report.publish import publish
 from proposer_rl.report.reading import UnreadableRun, begun, find_runs, read_run
 from proposer_rl.report.runs import share_map
 from research.claims import axis_means
-from research.publish import publish
 from tests.report.folders import LEVEL, TASK, cycle, write_run
 
 
@@ -138,7 +138,7 @@ def test_a_folder_that_cannot_be_read_is_named_in_one_line(
 def test_a_study_that_cannot_be_read_is_named_in_one_line(
     table: str, text: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("research.publish.write_page", lambda _: None)  # its figures
+    monkeypatch.setattr("proposer_rl.report.publish.write_page", lambda *_: None)  # its figures
     publish([write_run(tmp_path / "target_0", levels=[0.5])], light := tmp_path / "light")
     packed = b"no xz" if text is None else lzma.compress(text.encode())
     (light / f"{table}.csv.xz").write_bytes(packed)

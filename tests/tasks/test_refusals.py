@@ -52,7 +52,7 @@ MISREAD = [
     (WHOLE.replace("values: [1.0, 2.0]", "low: 1, high: 2, bins: 257").encode(),
      "task.parameters.width.bins=257: input should be less than or equal to 256"),
     (WHOLE.replace("target: 2.0", "target: .nan").encode(),
-     "task.parameters.width: target=[nan]: values=[nan] must be finite"),
+     "task.parameters.width.target=[nan]: values=[nan] must be finite"),
     ((WHOLE + "  transforms: [{_target_: torchrl.envs.NoSuch}]\n").encode(),
      "No module named 'torchrl.envs.NoSuch'"),
     (WHOLE.replace(f"{PARAMETERS}{WIDTH}", "  parameters: [width]\n").encode(),

@@ -181,12 +181,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a stream": ({"stream": True}, "^train_dataset: a stream, but must be a Dataset with one row"),
     "skipping ignored": ({"ignore_data_skip": True}, "ignore_data_skip=True: must be false"),
     "columns removed": ({"remove_unused_columns": True}, "remove_unused_columns=True: must be"),
-    "not attached": ({"attach": False}, "trainer: missing: call attach"),
     "no such column": ({"source": "family"}, "Column 'family' doesn't exist"),
     "attached before": ({"twice": True}, "duplicated columns but columns .'teacher_item'."),
-    "not its reward": ({"other": True}, "reward_funcs: must have this TaughtReward"),
+    "not its reward": ({"other": True}, "reward_funcs: must contain this TaughtReward"),
     "no share": ({"reward": torch.nan}, "success=nan: must be from"),
-    "no items": ({"space": prl.Parameters({"gravity": (5.0, 25.0)})}, "a space of Items"),
 }
 
 
@@ -196,8 +194,7 @@ def test_what_does_not_fit_is_refused_in_one_line(taught: Any, what: str, tmp_pa
     given, message = REFUSED[what]
     settings = {name: given[name] for name in given if name.endswith(("skip", "columns"))}
     with pytest.raises((ArgumentError, ValueError), match=message):
-        space = given.get("space") or prl.Items(given.get("items", ROWS))
-        teacher = prl.Teacher("domain_randomization", space)
+        teacher = prl.Teacher("domain_randomization", prl.Items(given.get("items", ROWS)))
 
         def scored(completions: list[str], **_: Any) -> list[float]:
             return [given.get("reward", 1.0)] * len(completions)
@@ -206,7 +203,7 @@ def test_what_does_not_fit_is_refused_in_one_line(taught: Any, what: str, tmp_pa
         settings |= SETTINGS["a generation a step"]
         used = scored if "other" in given else reward
         trainer = make(used, settings, tmp_path, given.get("stream", False))
-        for _ in range(given.get("attach", True) + given.get("twice", False)):
+        for _ in range(1 + given.get("twice", False)):
             reward.attach(trainer)
         train(trainer, 1)
 

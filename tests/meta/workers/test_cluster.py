@@ -17,8 +17,7 @@ from ray.cluster_utils import Cluster
 
 from proposer_rl.meta import workers as workers_module
 from proposer_rl.meta.workers import WorkersError, WorkerSettings
-from tests.meta.workers.curricula import cycles, make
-from tests.meta.workers.test_workers import assert_near
+from tests.meta.workers.test_workers import assert_near, cycles, make
 
 pytestmark = pytest.mark.skipif("RAY_CLUSTER" not in os.environ, reason="needs an idle machine")
 LIGHT = {"include_dashboard": False, "include_log_monitor": False}  # Ray gives a machine 30 s

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from signal import SIGKILL, SIGTERM, getsignal, signal
@@ -13,14 +13,73 @@ from typing import Any
 import pytest
 import torch
 
-from proposer_rl.curricula import TaskStudent
+from proposer_rl.cli.build import make_task
+from proposer_rl.cli.config import task_maker
+from proposer_rl.curricula import ProposerCurriculum, TaskStudent
 from proposer_rl.learning import DivergedError
 from proposer_rl.meta import replicas as replicas_module
 from proposer_rl.meta.replicas import shares
 from proposer_rl.meta.rewards import Reward, TrainingStep, performance_gain
-from proposer_rl.meta.workers import WorkersError
+from proposer_rl.meta.workers import WorkersError, WorkerSettings
+from proposer_rl.methods import Components, proposer
 from proposer_rl.streams import Streams
-from tests.meta.workers.curricula import cycles, make, workers
+from proposer_rl.task import ComputeContext, Task
+from tests.tiny import composed
+
+COPIES = 3
+OVERRIDES = ["+method=perf_gain", "+scale=smoke", f"proposer.rollouts={COPIES}"]
+# Three actions for each copy: the Proposer's forward pass is over all copies, wherever it is made.
+OVERRIDES += ["proposer.action_repeat=1", "compute.threads=1"]
+
+
+def workers(engine: Any) -> WorkerSettings:
+    return WorkerSettings(engine=engine, workers=2, devices=["cpu"], cores=1)
+
+
+def make(
+    elsewhere: WorkerSettings | None, reward: Reward = performance_gain
+) -> tuple[Task, ProposerCurriculum]:
+    settings = composed(*OVERRIDES)
+    maker = task_maker(settings.task)
+
+    def make_in_worker(device: str) -> Task:
+        return maker(solver=settings.solver, context=ComputeContext(torch.device(device)))
+
+    task = make_task(settings)
+    found = None if elsewhere is None else (elsewhere, make_in_worker)
+    return task, proposer(Components(task, settings.proposer, 0, workers=found), reward=reward)
+
+
+def cycles(
+    task: Task,
+    curriculum: ProposerCurriculum,
+    count: int = 2,
+    between: Callable[[], None] = lambda: None,
+) -> tuple[list[Any], list[float]]:
+    """What comes of cycles before each of which the Solver has trained: choices, and numbers."""
+    assert curriculum.trainer is not None
+    solver = task.learner([Streams(0, "solver")])
+    chosen: list[Any] = []
+    numbers: list[float] = []
+    for cycle in range(count):
+        student = TaskStudent(task, solver)
+        metrics = curriculum.improve(student, Streams(0, "cycle", cycle))
+        stream = Streams(0, "update", cycle)
+        levels = curriculum.propose(student, task.batch_size, stream)
+        solver.env.set_levels(levels.unsqueeze(0))
+        update = solver.update([stream.generator("actions")])
+        chosen += [metrics.pop("histogram"), student.frames, student.evaluations, metrics.keys()]
+        chosen += [levels.to_text(), update.rollout["action"].tolist()]
+        for value in metrics.values():
+            numbers += value if isinstance(value, list) else [] if value is None else [value]
+        numbers += update.rollout["next", "state_value"].flatten().tolist()
+        numbers += [float(value) for value in update.metrics.values()]
+        between()
+    for learner in (solver, curriculum.trainer.learner):
+        for entry in learner.snapshot().values(True, True):
+            numbers += entry.flatten().tolist()
+    return chosen, numbers
+
 
 Came = tuple[list[Any], list[float]]
 

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.batched_env import plays
+from proposer_rl.tasks.gymnasium.environment import UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.player import (
     GymLevel,
     LevelPlayer,
     MakeEnvironment,
     ParameterSettings,
-    imported,
 )
 from proposer_rl.tasks.ranges import spaces
 from tests.tasks.gymnasium.toys import LIMIT, NO_BOX2D, PARAMETERS, WALK, Walk
@@ -197,10 +196,11 @@ def test_a_longer_pole_obeys_the_equations_of_motion() -> None:
 REFUSED = [
     (numbers("lenght"), 1,
      "parameters.lenght: Walk has no attribute 'lenght'; numbers that it has: width, wind"),
-    ({"width": argument()}, -1, "refuses width=-1, seed=0: ValueError: width"),
-    ({"wdth": argument()}, 1, "refuses wdth=1, seed=0: TypeError: .*'wdth'"),
+    ({"width": argument()}, -1,
+     "constructor raises ValueError: width .*, on the level width=-1, seed=0"),
+    ({"wdth": argument()}, 1, "constructor raises TypeError: .*'wdth'.* level wdth=1"),
     ({"a": ParameterSettings(set="call", name="math.sqrt", values=[1], target=1)}, 1,
-     r"refuses a=1, seed=0: TypeError: .* \(player.py, line"),
+     r"parameters.a: TypeError: .* \(player.py, line"),
 ]  # fmt: skip
 
 
@@ -212,12 +212,6 @@ def test_what_the_environment_refuses_is_told(parameters: Any, value: int, messa
         )
         player.reset()
         player.reset()
-
-
-@pytest.mark.parametrize("name", ["nothing", "math.nothing", "nowhere.at_all", "math.pi"])
-def test_what_cannot_be_imported_is_told(name: str) -> None:
-    with pytest.raises(ValueError, match=name):
-        imported(name)
 
 
 @NO_BOX2D

@@ -28,9 +28,9 @@ from torchrl.envs import (
 )
 
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.gymnasium.answers import SuccessSettings, UnfitEnvironmentError
-from proposer_rl.tasks.gymnasium.attributes import (
-    AttributeRefusedError,
+from proposer_rl.tasks.gymnasium.environment import (
+    SuccessSettings,
+    UnfitEnvironmentError,
     read_attribute,
     write_attribute,
 )
@@ -81,7 +81,8 @@ MISREAD: list[tuple[dict[str, Any], str]] = [
     (steps(np.zeros(2)), "the reward must be a number, not array"),
     ({"step": lambda self, a: 1 / 0}, r"env_id=Odd.*step raises ZeroDivisionError: .*"
      r"\(test_trial.py, line \d+\), on the level goal=3, seed=\d+"),
-    (shows({"b": 1}, spaces.Dict({"a": spaces.Discrete(3)})), "refuses goal=3, .*KeyError: 'a'"),
+    (shows({"b": 1}, spaces.Dict({"a": spaces.Discrete(3)})),
+     "reset raises KeyError: 'a' .*on the level goal=3"),
     (shows({"a": "abc"}, spaces.Dict({"a": spaces.Text(3)})),
      "no network for Text.*its part a; .*FilterObservation"),
     ({"action_space": spaces.Tuple(PAIR)}, "action space Tuple.*there is a policy for"),
@@ -89,11 +90,11 @@ MISREAD: list[tuple[dict[str, Any], str]] = [
     (steps(info={"is_success": 0.3}), "success.key=is_success.*not 0.3"),
     (steps(info={"is_sucess": True, "a": {"b": 1}}), "it has: is_sucess, a, a.b; "),
     ({"metadata": None}, "env_id=Odd"),
-    ({"goal": property(lambda self: 3.0)}, "parameters.goal: goal of Odd cannot be set to"),
+    ({"goal": property(lambda self: 3.0)}, "parameters.goal: AttributeError: property 'goal'"),
     ({"reset": lambda self, **o: (sets_back(self), Line.reset(self, **o))[1]},
-     "parameters.goal: goal of Odd is 2.0, not 1, after a reset"),
+     "parameters.goal: goal of Odd is 2.0, not 1, after a reset and a step"),
     ({"step": lambda self, a: (sets_back(self), Line.step(self, a))[1]},
-     "parameters.goal: goal of Odd is 2.0, not 1, after a step"),
+     "parameters.goal: goal of Odd is 2.0, not 1, after a reset and a step"),
 ]  # fmt: skip
 
 
@@ -185,26 +186,28 @@ def test_a_number_gets_to_where_its_path_leads(path: str) -> None:
 @pytest.mark.parametrize(
     ("path", "message"),
     [
-        ("gravity", r"has the shape \[3\]; name one of its parts, as in name: gravity.0"),
-        ("sizes", r"has the shape \[2\]"),
+        (
+            "gravity",
+            r"is array\(.*, no place for 0.5; name one of its parts, as in name: gravity.0",
+        ),
+        ("sizes", r"is \[1.0, 2.0\], no place for 0.5; name one of its parts"),
         ("gravity.3", "has no attribute 'gravity.3'"),
         ("config.wind.force", "has no attribute 'config.wind.force'; numbers that it has"),
-        ("config", "is no number but a dict"),
-        ("kind", "is no number but a str"),
-        ("step", "is no number but a method"),
+        ("config", "config is {.*, no place for 0.5$"),
+        ("kind", "kind is 'dry', no place for"),
+        ("step", "no place for 0.5"),
         ("on", "on of Odd is True, not 0.5"),
         ("counts.0", "is 0, not 0.5"),
-        ("pair.0", "cannot be set to 0.5: TypeError"),
     ],
 )
 def test_what_cannot_hold_the_number_refuses_it(path: str, message: str) -> None:
-    with pytest.raises(AttributeRefusedError, match=message):
+    with pytest.raises(UnfitEnvironmentError, match=message):
         write_attribute(gymnasium.make(KINDS).unwrapped, path, 0.5)
 
 
 def test_what_is_only_passed_on_is_not_set_beside_it() -> None:
     environment: Any = gymnasium.make("PassesOn-v0").unwrapped
-    with pytest.raises(AttributeRefusedError, match="only passes 'drag' on"):
+    with pytest.raises(UnfitEnvironmentError, match="only passes 'drag' on"):
         write_attribute(environment, "drag", 0.5)
     write_attribute(environment, "inner.drag", 0.5)
     assert environment.drag == 0.5
@@ -213,8 +216,14 @@ def test_what_is_only_passed_on_is_not_set_beside_it() -> None:
 @pytest.mark.parametrize(
     ("wrapper", "message"),
     [
-        ("gymnasium.wrappers.NormalizeObservation", "it keeps running statistics"),
-        ("gymnasium.wrappers.NormalizeReward", "it keeps running statistics"),
+        (
+            "gymnasium.wrappers.NormalizeObservation",
+            "with it the same actions .* keeps running stat",
+        ),
+        (
+            "gymnasium.wrappers.NormalizeReward",
+            "with it the same actions .* keeps running stat",
+        ),
         ("gymnasium.wrappers.FilterObservation", "TypeError: .*filter_keys"),
     ],
 )
@@ -554,7 +563,7 @@ def test_evaluations_show_what_training_shows_and_pay_what_the_environment_pays(
         (lambda: Compose(VecNorm(in_keys=["observation"])), "VecNorm: it keeps running statistics"),
         (lambda: VecNormV2(in_keys=["observation"]), "VecNormV2: it keeps running statistics"),
         (lambda: FrameSkipTransform(2), "FrameSkipTransform: it steps on beyond an episode's end"),
-        (lambda: StepCounter(max_steps=4), "StepCounter: .* max_steps: take the task's"),
+        (lambda: StepCounter(max_steps=4), "StepCounter: .* max_steps; use the task's"),
     ],
 )
 def test_transforms_that_would_mislead_are_refused(make: Any, message: str) -> None:
