@@ -184,8 +184,7 @@ class GymnasiumTask(Task):
         evaluation = self._evaluation
         return {
             "Environment": f"{self.title}, at most {self.max_steps} steps",
-            "Target": "; ".join(f"{name} {bins}" for name, bins in self.target.bins.items())
-            or "any level",
+            "Target": str(self.target),
             "Measured on": f"{evaluation.levels} fixed levels of the target, and as many of "
             f"all bins; {evaluation.episodes} episode(s) on each, with "
             f"{evaluation.actions.replace('_', ' ')} actions",
