@@ -230,15 +230,11 @@ class GymnasiumTask(Task):
         self, levels: TensorDictBase, rollout: TensorDictBase | None
     ) -> list[NDArray[np.uint8]]:
         """Draws frames of levels [n], and of the Solver's first episode there [n, T]."""
-        if rollout is None:
-            return [self._camera.picture(play, None) for play in self._plays(levels)]
-        first = in_first_episode(rollout)
-        return [
-            self._camera.picture(play, actions[steps])
-            for play, actions, steps in zip(
-                self._plays(levels), rollout["action"], first, strict=True
-            )
-        ]
+        taken: list[Any] = [None] * len(levels)
+        if rollout is not None:
+            pairs = zip(rollout["action"], in_first_episode(rollout), strict=True)
+            taken = [actions[steps] for actions, steps in pairs]
+        return list(map(self._camera.picture, self._plays(levels), taken))
 
     def own_spaces(self) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any]]:
         """Returns the spaces of observations and actions of one environment with its wrappers.
