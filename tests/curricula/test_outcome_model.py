@@ -282,28 +282,22 @@ def test_features_that_are_not_finite_are_refused() -> None:
         curriculum.propose(Student(), 3, Streams(0))
 
 
-SPACES = {
-    "parameters": lambda: Parameters({"force": (0.5, 4.5)}, bins=4, target={"force": 4.5}),
-    "many items": lambda: Items(400, features=torch.linspace(0, 1, 400)[:, None], target=[399]),
-}
+SPACES = [
+    Parameters({"force": (0.5, 4.5)}, bins=4, target={"force": 4.5}),
+    Items(400, features=torch.linspace(0, 1, 400)[:, None], target=[399]),
+]
 
 
-@pytest.mark.parametrize("make", SPACES.values(), ids=SPACES)
-@pytest.mark.parametrize("method", ["model_transport", "domain_randomization"])
-def test_a_loop_of_ones_own_has_it_without_telling_more_than_returns(
-    make: Any, method: str
-) -> None:
+@pytest.mark.parametrize("space", SPACES, ids=["parameters", "many items"])
+def test_a_loop_of_ones_own_has_it_without_telling_more_than_returns(space: Any) -> None:
     """What is hard is in the upper half; a return of 1 below it, at times in its middle."""
-    if method == "model_transport" and make().size > 256:
-        pytest.skip("transport between so many bins takes long")
-    teacher = Teacher(method, make(), filter="model")
+    teacher = Teacher("domain_randomization", space, filter="model")
     torch.manual_seed(0)
     for _ in range(10):
         levels = teacher.propose(32)
         place = teacher.space.locate(levels if hasattr(levels, "keys") else {"item": levels})
         teacher.observe({"return": (torch.rand(32) < (-8 * place[..., 0]).sigmoid()).float()})
-    middle = float((place.abs() < 0.5).float().mean())
-    assert middle > 0.6 or method == "model_transport"
+    assert float((place.abs() < 0.5).float().mean()) > 0.6
     assert teacher.student.frames == teacher.student.evaluations == 0
 
 
