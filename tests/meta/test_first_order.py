@@ -328,15 +328,6 @@ def test_those_of_episodes_are_of_single_policy_gradients() -> None:
     torch.testing.assert_close(found, one_by_one(ppo, gained), rtol=1e-3, atol=1e-9)
 
 
-def test_nothing_is_drawn_at_random() -> None:
-    ppo, levels = TASK.learner([Streams(0)]), TASK.space.sample(2, Streams(0).generator())[None]
-    torch.manual_seed(3)
-    expected = torch.rand(4)
-    torch.manual_seed(3)
-    fo.LevelGradients(TASK).of_returns(ppo, levels)
-    assert torch.equal(torch.rand(4), expected)
-
-
 def test_where_the_return_cannot_change_it_is_zero() -> None:
     solvable, walled = "S..\n...\n..G", "S#.\n##.\n..G"
     levels = Level.from_text([walled, solvable, walled]).reshape(1, 3)
