@@ -13,14 +13,7 @@ from scipy.stats import spearmanr
 from sklearn.linear_model import LogisticRegression, Ridge
 from torch import Tensor
 
-from proposer_rl.curricula import (
-    Filtered,
-    Modelled,
-    SamplingCurriculum,
-    Scorer,
-    Student,
-    outcome_of,
-)
+from proposer_rl import curricula as c
 from proposer_rl.curricula.outcome_model import OutcomeModel, linear_ridge, logistic_ridge
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
@@ -165,7 +158,7 @@ def test_on_mazes_it_ranks_levels_by_their_exact_success_the_better_the_more_it_
     for batch in range(80):
         levels = TASK.space.sample(p, Streams(0, batch).generator())
         rollout = solver.play(levels, Streams(1, batch).generator())
-        reached = outcome_of(rollout).select("return", "success").double()
+        reached = c.outcome_of(rollout).select("return", "success").double()
         model.add(TASK.features(levels[None])[0], dict(reached.items()))
         if batch in (0, 79):
             told = model.predict(TASK.features(asked[None])[0])["success"]
@@ -196,14 +189,14 @@ def test_nobody_asks_the_task_how_well_the_student_does(
     assert {(row["evaluations"], row["curriculum_frames"]) for row in rows} == {(0, 0)}
 
 
-def scripted_filter(student: Scripted, **numbers: Any) -> Modelled:
+def scripted_filter(student: Scripted, **numbers: Any) -> c.Modelled:
     uniform = SimpleNamespace(
         sample=lambda n, g: torch.randint(student.space.size, (n,), generator=g)
     )
-    scorer = Scorer("learnability", "exact")
-    chosen = Filtered(SamplingCurriculum(uniform), scorer, times=8, temperature=0.03)
+    scorer = c.Scorer("learnability", "exact")
+    chosen = c.Filtered(c.SamplingCurriculum(uniform), scorer, times=8, temperature=0.03)
     student.space.locate = lambda bins: student.space.coordinates[bins]
-    return Modelled(chosen, lambda bins: space_features(student.space, bins), **numbers)
+    return c.Modelled(chosen, lambda bins: space_features(student.space, bins), **numbers)
 
 
 def test_it_finds_what_is_neither_mastered_nor_out_of_reach() -> None:
@@ -262,9 +255,9 @@ def test_success_that_is_not_needed_may_be_told_of_some_levels_alone() -> None:
 def test_features_that_are_not_finite_are_refused() -> None:
     uniform = SimpleNamespace(sample=lambda n, g: torch.zeros(n))
     features = lambda levels: levels.unsqueeze(-1) / 0  # noqa: E731
-    curriculum = Modelled(SamplingCurriculum(uniform), features)
+    curriculum = c.Modelled(c.SamplingCurriculum(uniform), features)
     with pytest.raises(ValueError, match="features: 3 of 3 numbers are not finite"):
-        curriculum.propose(Student(), 3, Streams(0))
+        curriculum.propose(c.Student(), 3, Streams(0))
 
 
 SPACES = [
