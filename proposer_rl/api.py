@@ -249,7 +249,7 @@ def train(
     task = as_recipe("task", "task", task)
     curriculum = as_recipe("curriculum", "method", curriculum)
     words, filtered = filter_asked(filter)
-    words = [*task.words, *curriculum.words, *([f"+scale={scale}"] if scale else []), *words]
+    words = [*task.words, *curriculum.words, *([f"scale={scale}"] if scale else []), *words]
     more: dict[str, Any] = {"seed": seed, "compute": {"progress": progress}}
     if updates is not None:
         more["schedule"] = {"updates": updates}

@@ -1,7 +1,8 @@
-"""Makes a curriculum from its configuration and the parts of a run, by ``build``.
+"""Builds a curriculum from its configuration and the parts of a run.
 
-The other functions here are named in configurations, too: they make the curricula that are no
-class of their own, and those with a Proposer.
+:func:`build` calls the class or function that a configuration names. The functions after it are
+named in configurations, too: they make curricula that have no class of their own, and those with a
+Proposer.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ from proposer_rl.recipes import (
     plain_values,
     recipe_function,
 )
-from proposer_rl.runs.checkpoint import CheckpointError, State, learnt_curriculum
+from proposer_rl.runs.checkpoint import State, learnt_curriculum
 from proposer_rl.settings import (
     ArgumentError,
     Count,
@@ -58,15 +59,16 @@ from proposer_rl.settings import (
     WholeKeyError,
     checked,
     configured,
+    refuse_unknown,
     schema,
     with_defaults,
     within,
 )
 from proposer_rl.streams import Streams
 
-# What bad input raises in what a configuration names, which may be anybody's.
-CANNOT_BE_CALLED = (ValueError, TypeError, NameError)
-# What is put around a curriculum, by the key of its settings.
+# Bad input raises these in the classes and functions that a configuration names.
+INPUT_ERRORS = (ValueError, TypeError, NameError)
+# These are put around a curriculum, each by its key in the configuration.
 AROUND: dict[str, Callable[..., Curriculum]] = {
     "filter": Filtered.around,
     "model": Modelled.around,
@@ -74,34 +76,32 @@ AROUND: dict[str, Callable[..., Curriculum]] = {
 
 
 def build(config: Mapping[str, Any], run: Components) -> Curriculum:
-    """Makes a curriculum for a run, with the filter and the model around it, if any.
+    """Builds a curriculum for a run, with the filter and the model around it, if any.
 
     Args:
         config: with ``curriculum``, and perhaps ``filter`` and ``model``. ``_target_`` of the
-            curriculum names a class with a method ``create``, or a function; it is called with the
-            run and the other settings, which are its keyword-only arguments.
-        run: what the run has.
+            curriculum names a class with a method ``create``, or a function. It is called with the
+            run; the other settings are its keyword-only arguments.
+        run: the parts of the run.
 
     Raises:
-        ArgumentError: with the key that is not allowed, and what is; if the task lacks what is
-            asked of it.
+        ArgumentError: naming a key that is not allowed, and what is; if the task lacks something
+            that the curriculum uses.
     """
     make, settings = maker("curriculum", config["curriculum"])
-    with within("curriculum", *CANNOT_BE_CALLED):
+    with within("curriculum", *INPUT_ERRORS):
         try:
-            curriculum = make(run, **configured(make, settings))
+            curriculum: Curriculum = make(run, **configured(make, settings))
         except AttributeError as error:
             if error.obj is not run.task:
                 raise
             said = f"needs {error.name} of a task, which {type(run.task).__name__} does not define"
             raise TypeError(said) from error
-        if not isinstance(curriculum, Curriculum):
-            raise TypeError(f"must make a Curriculum, but makes {type(curriculum).__name__}")
     return around(curriculum, config, run)
 
 
 def around(curriculum: Curriculum, config: Mapping[str, Any], run: Components) -> Curriculum:
-    """Returns a curriculum with the filter and the model around it that a configuration has."""
+    """Returns a curriculum with the filter and the model of a configuration around it."""
     for key, make in AROUND.items():
         if config.get(key) is not None:
             with within(key, ValueError):
@@ -110,7 +110,7 @@ def around(curriculum: Curriculum, config: Mapping[str, Any], run: Components) -
 
 
 def completed(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a configuration with the defaults of what :func:`build` makes of it."""
+    """Returns a configuration with all defaults of what :func:`build` makes of it."""
     found, curriculum = dict(config), config.get("curriculum")
     if isinstance(curriculum, Mapping):
         make, _ = maker("curriculum", {"_target_": curriculum.get("_target_")})
@@ -122,27 +122,19 @@ def completed(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def filter_asked(filter: Mapping[str, Any] | str | None) -> tuple[list[str], dict[str, Any]]:
-    """Returns words for Hydra that set a filter, and settings that do.
+    """Returns a filter as words for Hydra and settings to be merged into what it composes.
 
     Args:
-        filter: a name in ``conf/filter``, or settings; with any of a model's, such as ``labels``,
-            the rest is as in ``conf/filter/model.yaml``.
-
-    Raises:
-        ArgumentError: if there is no such file.
+        filter: a name in ``conf/filter``, or settings. If settings of a model are among them, such
+            as ``labels``, the others have the defaults of ``conf/filter/model.yaml``.
     """
     if filter is None:
         return [], {}
     if isinstance(filter, str):
-        if filter not in available("filter"):
-            raise ArgumentError(f"filter={filter!r}: must be one of {available('filter')}")
-        return [f"+filter={filter}"], {}
-    own = {name: value for name, value in filter.items() if name in schema(Modelled.around)}
-    rest = {name: value for name, value in filter.items() if name not in own}
-    if not own:
-        return [], {"filter": rest}
-    file = plain_values(composed([NO_TASK, "+filter=model"]).filter)
-    return [], {"filter": {**file, **rest}, "model": own}
+        return [f"filter={filter}"], {}
+    model = {name: value for name, value in filter.items() if name in schema(Modelled.around)}
+    rest = {name: value for name, value in filter.items() if name not in model}
+    return (["filter=model"], {"filter": rest, "model": model}) if model else ([], {"filter": rest})
 
 
 def asked(
@@ -152,8 +144,9 @@ def asked(
 
     Args:
         recipe: of the curriculum; None for a filter alone.
-        filter: as of :func:`filter_asked`.
-        resolve: whether a reference such as ``${pool.capacity}`` becomes what ``train.yaml`` has.
+        filter: as for :func:`filter_asked`.
+        resolve: whether to replace references such as ``${pool.capacity}`` by the values in
+            ``conf/train.yaml``.
     """
     words, settings = filter_asked(filter)
     made = recipe or Recipe("method", "")
@@ -163,34 +156,28 @@ def asked(
 
 
 def mixture(run: Components, *, parts: dict[str, dict[str, Any]]) -> Mixed:
-    """Makes batches of which each of some methods has its share.
+    """Makes batches of which several methods each have a share.
 
     Args:
-        run: what the run has.
-        parts: by the names of methods, the settings that differ from their defaults; besides
-            ``share``, of the levels of a batch (1; with 0 the method is left out), and ``filter``,
-            as :func:`filter_asked` takes it.
+        run: the parts of the run.
+        parts: by the names of methods, the settings that differ from their defaults. Besides these,
+            ``share`` of the levels of a batch (1; with 0 the method is left out), and ``filter``,
+            as for :func:`filter_asked`.
 
     Raises:
-        ArgumentError: for an unknown method, a setting that it does not have, one that its file
-            takes from elsewhere and that is not given, or shares that are all zero.
+        ArgumentError: for an unknown method or setting, for a setting that the method's file takes
+            from elsewhere and that is not given, or if all shares are zero.
     """
-    for name in parts:
-        if name not in available("method"):
-            raise ArgumentError(
-                f"parts.{name}: unknown; there are: {', '.join(available('method'))}"
-            )
     made: list[tuple[Curriculum, float]] = []
-    for name, given in parts.items():
-        try:
-            made += _part(run, name, **given)
-        except ArgumentError as error:
-            line = str(error).removeprefix("curriculum.")
-            raise ArgumentError(f"parts.{name}.{line}") from error
-    if not made:
-        raise ArgumentError(f"parts={list(parts)}: must have one whose share is above 0")
-    curricula, shares = zip(*made, strict=True)
-    return Mixed(list(curricula), list(shares))
+    with within("parts"):
+        refuse_unknown(parts, available("method"))
+        for name, given in parts.items():
+            try:
+                made += _part(run, name, **given)
+            except ArgumentError as error:
+                line = str(error).removeprefix("curriculum.")
+                raise ArgumentError(f"{name}.{line}") from error
+    return Mixed([curriculum for curriculum, _ in made], [share for _, share in made])
 
 
 @checked
@@ -203,14 +190,14 @@ def _part(
     filter: str | dict[str, Any] | None = None,
     **given: Any,
 ) -> list[tuple[Curriculum, float]]:
-    """Returns a part of a mixture and its share, or nothing if that is 0."""
+    """Returns a part of a mixture and its share; nothing if that is 0."""
     if not share:
         return []
     recipe = recipe_function("method", name, Modelled.around)(**given)
     config = asked(recipe, filter, resolve=False)
     for key, value in config["curriculum"].items():
         if isinstance(value, str) and value.startswith("${"):
-            raise ArgumentError(f"{key}: missing; alone the method has that of {value[2:-1]}")
+            raise ArgumentError(f"{key}: missing; the method by itself has that of {value[2:-1]}")
     return [(build(config, run), share)]
 
 
@@ -228,7 +215,7 @@ def schedule(run: Components, *, distributions: list[str], until: list[int]) -> 
     """Trains on named distributions one after another: a hand-designed curriculum.
 
     Args:
-        run: what the run has.
+        run: the parts of the run.
         distributions: names, in order.
         until: updates after which each but the last ends.
 
@@ -236,8 +223,8 @@ def schedule(run: Components, *, distributions: list[str], until: list[int]) -> 
         ArgumentError: for an unknown name, or as :class:`~proposer_rl.curricula.Schedule`.
     """
     known = run.task.distributions
-    if any(name not in known for name in distributions):
-        raise ArgumentError(f"distributions={distributions}: must be some of {sorted(known)}")
+    with within("distributions"):
+        refuse_unknown(distributions, known)
     return Schedule([SamplingCurriculum(known[name]) for name in distributions], until)
 
 
@@ -253,13 +240,13 @@ def proposer(
     Args:
         run: the task, and the Proposer's settings.
         loss: of the Proposer; None for PPO's. See :class:`~proposer_rl.learning.PPO`.
-        reward: from an update to a number for each replica of the Solver.
-        checkpoint: of a Proposer that has learnt, which goes on learning; see
-            :func:`frozen_proposer`. None for a new one.
+        reward: maps an update to a number for each replica of the Solver.
+        checkpoint: of a trained Proposer, which goes on learning; see :func:`frozen_proposer`. None
+            for a new one.
 
     Raises:
         ArgumentError: if the checkpoint holds no such Proposer, or cannot be read.
-        WholeKeyError: for settings of the Proposer that do not go together.
+        WholeKeyError: for settings of the Proposer that contradict each other.
     """
     task, config = run.task, run.proposer
     if config.advantage == "leave_one_out" and config.rollouts < 2:
@@ -271,8 +258,8 @@ def proposer(
     unknown = [name for name in config.observes if name not in env.observation_spec.keys()]
     if unknown:
         raise WholeKeyError(
-            f"proposer.observes={config.observes}: this task does not tell {', '.join(unknown)}; "
-            "return and progress are available"
+            f"proposer.observes={config.observes}: this task has no {', '.join(unknown)}; return "
+            "and progress are available"
         )
     agent = _agent(run, config, checkpoint)
     numbers = PPOSettings(horizon=env.steps, **asdict(config.ppo))
@@ -289,13 +276,13 @@ def proposer(
 def task_difficulty(run: Components, *, checkpoint: str | None = None) -> ProposerCurriculum:
     """Makes the paper's ablation: a Proposer that is rewarded for the Solver's failures.
 
-    No other reward can be put in the place of this one.
+    Its reward is fixed, so that an ablation cannot replace it under the same name.
     """
     return proposer(run, reward=rewards.task_difficulty, checkpoint=checkpoint)
 
 
 def frozen_proposer(run: Components, *, checkpoint: str | None = None) -> ProposerCurriculum:
-    """Makes a curriculum of a Proposer that has learnt in another run, and learns no more.
+    """Makes a curriculum of a Proposer that was trained in another run, and learns no more.
 
     Args:
         run: the task, and the settings of the Proposer's network and actions, which must be
@@ -303,7 +290,7 @@ def frozen_proposer(run: Components, *, checkpoint: str | None = None) -> Propos
         checkpoint: a checkpoint of that run, its ``proposer.pt``, or its folder.
 
     Raises:
-        ArgumentError: if nothing is named, it holds no such Proposer, or cannot be read.
+        ArgumentError: if none is named, it holds no such Proposer, or cannot be read.
     """
     if not checkpoint:
         raise ArgumentError(
@@ -335,11 +322,11 @@ def first_order_proposer(
     """Makes a Proposer that is rewarded for each problem with its first-order share of the gain.
 
     Args:
-        run: the task, and the Proposer's settings, of which probes, network, and PPO's
-            ``adam_eps``, ``clip_epsilon`` and ``max_grad_norm`` count.
+        run: the task, and the Proposer's settings. Only its probes, its network and PPO's
+            ``adam_eps``, ``clip_epsilon`` and ``max_grad_norm`` have an effect.
         checkpoint: of such a policy that has learnt; None for a new one.
         target_levels: see :class:`FirstOrderProposer`, as for the next two.
-        step: of the differences that tell the rewards.
+        step: of the finite differences from which the rewards are computed.
         measure: of the target's performance.
         epochs: gradient steps on the draws of each of the Solver's updates.
         learning_rate: of the policy.
@@ -363,7 +350,7 @@ def paired(
     The arguments are those of :func:`first_order_proposer`.
 
     Raises:
-        ArgumentError: where episodes go on from update to update.
+        ArgumentError: where episodes continue from update to update.
     """
     policy = _problem_policy(run, epochs, learning_rate, entropy_coeff, checkpoint)
     task, stream = run.task, Streams(run.seed, "antagonist")
@@ -397,7 +384,7 @@ def _problem_policy(
 
 
 def _agent(run: Components, config: ProposerSettings, checkpoint: str | None) -> ActorCritic:
-    """Makes a Proposer, with the weights of one that has learnt with the same network if any.
+    """Makes a Proposer, with trained weights from a checkpoint, if any.
 
     Args:
         run: the task, and the seed of new weights.
@@ -405,31 +392,24 @@ def _agent(run: Components, config: ProposerSettings, checkpoint: str | None) ->
         checkpoint: of a run, its ``proposer.pt``, or its folder; None for new weights.
 
     Raises:
-        ArgumentError: if the checkpoint holds no such Proposer, or cannot be read.
+        ArgumentError: if the checkpoint holds no Proposer with this network, or cannot be read.
     """
     with Streams(run.seed, "proposer").as_default("weights"):
         agent = proposer_agent(run.task, config)
     if not checkpoint:
         return agent
-    try:
+    with within("checkpoint", OSError, ValueError, lead=f"checkpoint={checkpoint}: "):
         learnt = _with_proposer(learnt_curriculum(Path(checkpoint)))
+        load_agent(agent, TensorDict(learnt.get("proposer", {})))
         observed = [name for name in learnt["observed"] if name != "probes"]
-        load_agent(agent, TensorDict(learnt["proposer"]))
-    except (CheckpointError, OSError) as error:
-        raise ArgumentError(f"checkpoint={checkpoint}: {error}") from error
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ArgumentError(
-            f"checkpoint={checkpoint}: holds no Proposer with the network of these settings"
-        ) from error
-    if observed != config.observes:
-        raise ArgumentError(
-            f"checkpoint={checkpoint}: its Proposer has learnt with observes={observed}, not "
-            f"{config.observes}"
-        )
+        if observed != config.observes:
+            raise ValueError(
+                f"its Proposer has learnt with observes={observed}, not {config.observes}"
+            )
     return agent
 
 
 def _with_proposer(state: State) -> State:
-    """Returns the state of the part that has a Proposer, where curricula hold others."""
+    """Returns the part of a curriculum's state that has a Proposer; empty if none has."""
     inner = (_with_proposer(part) for part in reversed(state.get("parts", [])))
     return state if "proposer" in state else next(filter(None, inner), {})

@@ -1,7 +1,7 @@
-"""Tasks and curricula by name: what ``prl.tasks.maze()`` and ``prl.curricula.plr()`` return.
+"""Recipes of tasks and curricula by name, which ``prl.tasks.maze()`` and so on return.
 
-The names are those of the files in ``conf/task`` and ``conf/method``, which the command line reads,
-too. Hydra composes them, and settings from Python are merged into what it has composed.
+The names are those of the files in ``conf/task`` and ``conf/method``, which the command line also
+reads. Hydra composes the files, and settings given in Python are merged into the result.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 PACKAGE = Path(__file__).resolve().parent
-# In a wheel the configuration lies in the package, in a checkout beside it.
+# A wheel has the configuration inside of the package, a checkout beside it.
 CONFIG_FOLDER = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"
-DEFAULT_METHOD = "adaptive_mixture"  # for those who do not want to choose
-NO_TASK = "~task"  # the word for Hydra with which no file of a task is composed
-COMPOSING = RLock()  # Hydra composes with globals of the process
+DEFAULT_METHOD = "adaptive_mixture"
+NO_TASK = "~task"  # an override of Hydra's: compose no file of a task
+COMPOSING = RLock()  # Hydra keeps its state in globals of the process
 Group = Literal["task", "method"]
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A task or a curriculum that is made when a run begins.
+    """Describes a task or a curriculum, which is made when a run begins.
 
     Attributes:
         group: ``"task"`` or ``"method"``.
-        name: of a file in that folder of the configuration; or of a function of one's own.
-        words: that Hydra composes it from, as on the command line.
-        settings: that are merged into what it has composed, by top-level key.
+        name: of a file in that folder of the configuration, or of a function of one's own.
+        words: overrides from which Hydra composes it.
+        settings: merged into what Hydra has composed, by top-level key.
     """
 
     group: Group
@@ -48,12 +48,12 @@ class Recipe:
 
 
 def own_recipe(group: Group, make: Callable[..., Any], **settings: Any) -> Recipe:
-    """Returns a recipe for a class or function of one's own, which must be importable.
+    """Returns the recipe of a task or curriculum of one's own.
 
     Args:
         group: ``"task"``, or ``"method"`` for a curriculum.
-        make: of a task, called with the settings, ``solver`` and ``context``; of a curriculum, a
-            class with ``create`` or a function, see :func:`proposer_rl.methods.build`.
+        make: a class or function that can be imported. For a task it is called with the settings,
+            ``solver`` and ``context``; for a curriculum see :func:`proposer_rl.methods.build`.
         settings: numbers, texts, lists and mappings.
 
     Raises:
@@ -62,19 +62,19 @@ def own_recipe(group: Group, make: Callable[..., Any], **settings: Any) -> Recip
     own = {"_target_": _dotted("make", make), **settings}
     if group == "method":
         return Recipe(group, make.__name__, (), {"method": make.__name__, "curriculum": own})
-    # As most tasks call what is to be mastered; a headline that is given comes after it.
+    # Most tasks call the distribution to be mastered so; a headline that is given overrides this.
     schedule = {"headline": "target_success"}
     return Recipe(group, make.__name__, (NO_TASK,), {"task": own, "schedule": schedule})
 
 
 def storable(key: str, value: Any) -> Any:
-    """Returns a value as JSON has it, with the dotted names of functions in their place.
+    """Returns a value as JSON stores it, with functions replaced by their dotted names.
 
     Raises:
-        ArgumentError: naming the key, for a function that cannot be imported by its name, and for
-            what JSON has not.
+        ArgumentError: naming the key, for a function that cannot be imported by its name, and for a
+            value of a type that JSON does not have.
     """
-    from proposer_rl.settings import plain, shown  # which help does without
+    from proposer_rl.settings import plain, shown  # not needed for help, and slow to import
 
     def named(inner: Any) -> str:
         if callable(inner):
@@ -90,13 +90,13 @@ def _dotted(key: str, function: Any) -> str:
     if function.__module__ == "__main__" or "<" in dotted:
         raise _refusal(
             f"{key}={dotted}: must be importable, as a class or function of a module is, so that "
-            "watch, eval and play can make it again"
+            "eval and play can make it again"
         )
     return dotted
 
 
 def available(group: str, folder: Path = CONFIG_FOLDER) -> list[str]:
-    """Returns the names of a group's files, such as ``method``, in a folder of configurations."""
+    """Returns the names of the files of a group, such as ``method``, in a folder."""
     return sorted(file.stem for file in (folder / group).glob("*.yaml"))
 
 
@@ -107,7 +107,7 @@ HOW = {
 
 
 def as_recipe(argument: str, group: Group, given: Any) -> Recipe:
-    """Returns a recipe, also of its name.
+    """Returns a recipe that is given itself or by its name.
 
     Raises:
         ArgumentError: naming the argument, if it is neither.
@@ -120,7 +120,7 @@ def as_recipe(argument: str, group: Group, given: Any) -> Recipe:
 
 
 def _words(group: Group, name: str) -> tuple[str, ...]:
-    return (f"{'+' if group == 'method' else ''}{group}={name}",)
+    return (f"{group}={name}",)
 
 
 @cache
@@ -132,17 +132,17 @@ def recipe_function(
     Args:
         group: ``"task"`` or ``"method"``.
         name: of a file.
-        around: makes the model that a method's file may have; its settings are the method's, too.
+        around: makes the model that a method's file may have; its settings are accepted, too.
 
     Raises:
         AttributeError: if there is no such file, with those that there are.
     """
     if name not in available(group):
         raise AttributeError(f"there is no {name!r}; there are: {', '.join(available(group))}")
-    from proposer_rl.settings import check_names, schema  # which help does without
+    from proposer_rl.settings import check_names, schema  # not needed for help
 
     words = _words(group, name)
-    known: dict[str, dict[str, Parameter]] = {}  # by the key that they stand below
+    known: dict[str, dict[str, Parameter]] = {}  # by top-level key
     if group == "task":
         known["task"] = _over({}, composed(words).task)
     else:
@@ -170,10 +170,10 @@ def recipe_function(
 
 
 def _over(known: Mapping[str, Parameter], file: DictConfig) -> dict[str, Parameter]:
-    """Returns the settings of a file, and those of what makes an object of it."""
+    """Returns known settings with the defaults of a file, and further settings of the file."""
     found = dict(known)
     for name, value in plain_values(file).items():
-        default = Parameter.empty if value == "???" else value  # to be given
+        default = Parameter.empty if value == "???" else value  # Hydra's mark of a required value
         setting = known.get(name, Parameter(name, Parameter.KEYWORD_ONLY))
         found[name] = setting.replace(default=default)
     found.pop("_target_", None)
@@ -181,14 +181,14 @@ def _over(known: Mapping[str, Parameter], file: DictConfig) -> dict[str, Paramet
 
 
 def composed(words: Sequence[str], *settings: Mapping[str, Any]) -> DictConfig:
-    """Returns what Hydra composes from words such as ``+method=plr``, and settings merged into it.
+    """Returns the configuration that Hydra composes, with settings merged into it.
 
     Args:
-        words: as on the command line.
-        settings: by top-level key; later ones win.
+        words: overrides such as ``method=plr``.
+        settings: by top-level key; of two values the later one counts.
 
     Raises:
-        ArgumentError: for what is in no file, or does not fit.
+        ArgumentError: for a file or key that does not exist, or a value that does not fit.
     """
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
@@ -196,7 +196,7 @@ def composed(words: Sequence[str], *settings: Mapping[str, Any]) -> DictConfig:
     from yaml import YAMLError
 
     try:
-        # A teacher's settings may have functions in them.
+        # The settings of a teacher may contain functions.
         more = [OmegaConf.create(dict(s), flags={"allow_objects": True}) for s in settings]
         config: Any = OmegaConf.merge(_composed(tuple(words)), *more)
         return config
@@ -224,7 +224,7 @@ def _composed(words: tuple[str, ...]) -> DictConfig:
 
 
 def plain_values(config: Any, resolve: bool = False) -> dict[str, Any]:
-    """Returns a part of a configuration as Python's own, references to other parts as they are."""
+    """Returns a part of a configuration as a dict, by default with references unresolved."""
     from omegaconf import OmegaConf
 
     values: Any = OmegaConf.to_container(config, resolve=resolve)
@@ -232,16 +232,16 @@ def plain_values(config: Any, resolve: bool = False) -> dict[str, Any]:
 
 
 def maker(key: str, values: Mapping[str, Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Returns what makes an object of a configuration, and the settings to call it with.
+    """Returns the function that a part of a configuration names, and the settings for its call.
 
     Args:
         key: of the configuration, such as ``curriculum``.
-        values: at that key. ``_target_`` names a class or function; of a class with a method
-            ``create`` that one is returned. Values that have a ``_target_`` themselves are made by
-            Hydra.
+        values: at that key. ``_target_`` names a class or function; if it is a class with a method
+            ``create``, that method is returned. Hydra instantiates values that have a ``_target_``
+            themselves.
 
     Raises:
-        ArgumentError: if nothing is named, or it cannot be imported.
+        ArgumentError: if ``_target_`` is missing, or cannot be imported.
     """
     from hydra.errors import HydraException
     from hydra.utils import instantiate
@@ -249,7 +249,7 @@ def maker(key: str, values: Mapping[str, Any]) -> tuple[Callable[..., Any], dict
     if not isinstance(values.get("_target_"), str):
         raise _refusal(
             f"{key}._target_: missing: the class or function that makes the {key}; a file of "
-            "your own has it from another, such as by `defaults: [gymnasium, _self_]`"
+            "your own can take it from another, as with `defaults: [gymnasium, _self_]`"
         )
     try:
         made = instantiate({**values, "_partial_": True}, _convert_="all")
@@ -264,34 +264,30 @@ def maker(key: str, values: Mapping[str, Any]) -> tuple[Callable[..., Any], dict
 
 
 def explained(error: Exception) -> str:
-    """Returns one line on an error in composing: an unknown file or key with those that exist."""
-    from hydra.errors import MissingConfigException, OverrideParseException
-    from omegaconf import DictConfig
-    from omegaconf.errors import ConfigAttributeError, ConfigKeyError
+    """Returns an error of Hydra's in one line; of an unknown file or key, with those that exist."""
+    from hydra.errors import MissingConfigException
+
+    from proposer_rl.settings import unknown
 
     if isinstance(error, MissingConfigException) and error.options:
-        return f"{error.missing_cfg_file}: unknown; choose one of: {', '.join(error.options)}"
-    said = " ".join(str(error).split())
-    if isinstance(error, OverrideParseException):
-        return f"{error.override}: {said}"
+        return unknown(str(error.missing_cfg_file), error.options)
     cause: Any = error.__cause__
-    if isinstance(cause, ConfigAttributeError | ConfigKeyError):
-        holder = cause.parent_node
-        if isinstance(holder, DictConfig):
-            known = sorted(str(key) for key in holder if holder._get_full_key(key) != "hydra")
-            return f"{cause.full_key}: unknown; there are: {', '.join(known) or 'none'}"
-    return ": ".join(" ".join(str(each).split()) for each in (error, cause) if each)
+    holder = getattr(cause, "parent_node", None)
+    if isinstance(cause, AttributeError | KeyError) and isinstance(holder, Mapping):
+        return unknown(cause.full_key, sorted({*holder} - {"hydra"}))
+    said = getattr(error, "override", None), error, cause
+    return ": ".join(" ".join(str(each).split()) for each in said if each)
 
 
 def comments(file: Path) -> Iterator[str]:
-    """Yields the lines of a file that begin with a #, without the one that Hydra reads."""
-    # What is no UTF-8 is refused where it is used.
+    """Yields the comment lines of a file, without the one that Hydra reads."""
+    # Hydra itself refuses a file that is not UTF-8.
     for line in file.read_text(encoding="utf-8-sig", errors="replace").splitlines():
         if line.startswith("#") and not line.startswith("# @package"):
             yield line.lstrip("# ")
 
 
 def _refusal(line: str) -> ValueError:
-    from proposer_rl.settings import ArgumentError  # help needs none, and it takes time to import
+    from proposer_rl.settings import ArgumentError  # not needed for help, and slow to import
 
     return ArgumentError(line)

@@ -1,9 +1,9 @@
-"""Validates arguments against annotated signatures.
+"""Validates arguments against annotated signatures, by pydantic.
 
-:func:`checked` holds a constructor or a factory to the types and bounds of its own signature, for
-whoever calls it; the command line asks the same of what it makes, by :func:`arguments`, and puts
-its key before the line. Settings are frozen dataclasses that are checked in this way, too: see
-:func:`settings`. ``conf/train.yaml`` lists the same values (a test compares them).
+:func:`checked` validates every call of a function, :func:`arguments` the values with which a
+function is going to be called, such as those of a configuration. Settings are frozen dataclasses
+that are validated in the same way: see :func:`settings`. ``conf/train.yaml`` lists their defaults
+again (a test compares them).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import inspect
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from operator import index
@@ -44,35 +44,35 @@ NotNegative = Annotated[float, Ge(0)]
 
 
 NAMED = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-SHOULD = "input should be "  # as pydantic begins most of its lines
+SHOULD = "input should be "  # so begin most of pydantic's messages
 
 BY_KIND = Discriminator("kind")
 """Tells the members of a union of settings apart, by the entry ``kind`` of each."""
 
 
 class ArgumentError(ValueError):
-    """An argument is not allowed: one line ``name=value: what is allowed``.
+    """An argument is not allowed; the message is one line, ``name=value: what is allowed``.
 
-    Rules that join several arguments raise it in the same form. A callable that passes on what it
-    was given as one argument puts that argument's name and a dot before the line.
+    A function that passes on the entries of one of its own arguments puts the name of that argument
+    and a dot before the line; see :func:`within`.
     """
 
     exit_code = 2
 
 
 class WholeKeyError(ArgumentError):
-    """Another setting is not allowed where this one is: the line has its whole key."""
+    """A setting of another part of the configuration is not allowed; the line has its whole key."""
 
 
 def checked(function: Callable[P, T]) -> Callable[P, T]:
-    """Holds every call of a function to its signature; of a class, decorate ``__init__``.
+    """Validates the arguments of every call of a function; of a class, decorate ``__init__``.
 
-    What may be given stands in the annotations alone: ``step: Positive``,
+    The annotations say what is allowed: ``step: Positive``,
     ``source: Literal["exact", "episodes"]``, ``every: Annotated[int, Interval(ge=1, le=100)]``.
-    See :func:`arguments` for how values are read. Defaults are not checked.
+    :func:`arguments` says how values are read. Defaults are not validated.
 
     Raises:
-        ArgumentError: by the decorated function, for the first argument that is not allowed.
+        ArgumentError: from the decorated function, for the first argument that is not allowed.
 
     Example:
         >>> @checked
@@ -96,7 +96,7 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def signed(made: type[T]) -> type[T]:
-    """Gives a class its constructor's signature, which TorchRL's metaclass of environments hides.
+    """Restores the signature of a class, which TorchRL's metaclass of environments hides.
 
     Example:
         >>> from torchrl.envs import EnvBase
@@ -114,25 +114,24 @@ def signed(made: type[T]) -> type[T]:
 def arguments(
     function: Callable[..., Any], values: Mapping[str, Any], given: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Checks arguments against the signature of what will be called with them.
+    """Validates the values with which a function is going to be called.
 
-    Numbers are read strictly (true is no number, "3" is none, 1.0 no integer), infinity and NaN are
-    refused, a list may stand for a tuple and a mapping for settings. Other libraries' numbers,
-    arrays, lists and mappings are read as Python's own; see :func:`plain`. An argument whose type
-    says nothing that could be checked, such as a task or a tensor, is passed on as it is.
+    Numbers are read strictly (true and "3" are no numbers, 1.0 is no integer); infinity and NaN are
+    refused. A list is allowed for a tuple, and a mapping for settings. Numbers, arrays, lists and
+    mappings of other libraries are read as Python's own; see :func:`plain`. Values of types that
+    pydantic does not know, such as tasks and tensors, are returned as they are.
 
     Args:
         function: a class or function.
         values: by name.
-        given: names of arguments that it gets otherwise.
+        given: names of arguments that the function gets from elsewhere.
 
     Returns:
-        The same arguments, with the values as the signature's types have them.
+        The values, converted to the types of the signature.
 
     Raises:
-        ArgumentError: for the first value that is not allowed, and what is; for an unknown name,
-            and which there are; for a name that is missing.
-        NameError: if the annotations name what cannot be found.
+        ArgumentError: for the first value that is not allowed, an unknown name, or a missing one.
+        NameError: if an annotation cannot be resolved.
 
     Example:
         >>> from typing import Literal
@@ -150,16 +149,16 @@ def arguments(
 
 
 def schema(make: Callable[..., Any]) -> dict[str, inspect.Parameter]:
-    """Returns what a configuration may set of a function: its keyword-only arguments, by name.
+    """Returns the arguments of a function that a configuration may set: the keyword-only ones.
 
-    Where a class's method, such as ``Curriculum.create``, takes ``**settings``, these are the
-    keyword-only arguments of the class's constructor.
+    If the method of a class, such as ``Curriculum.create``, takes ``**settings``, these stand for
+    the keyword-only arguments of the class's constructor.
     """
     return {name: p for name, p in _parameters(make).items() if p.kind >= p.KEYWORD_ONLY}
 
 
 def configured(make: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Checks values against the :func:`schema` of a function, as :func:`arguments` does."""
+    """Validates values against the :func:`schema` of a function, as :func:`arguments` does."""
     check_names(schema(make), values)
     return _checked_values(make, values)
 
@@ -176,10 +175,10 @@ def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
 
 
 def with_defaults(make: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns values over the defaults of a function's :func:`schema`, those that JSON can hold."""
+    """Returns values merged into the defaults of a function's :func:`schema`."""
     found = {}
     for name, parameter in schema(make).items():
-        with suppress(TypeError):  # such as where there is none
+        with suppress(TypeError):  # there is no default, or none that JSON can hold
             found[name] = json.loads(json.dumps(parameter.default))
     return {**found, **values}
 
@@ -188,16 +187,25 @@ def check_names(
     known: Mapping[str, inspect.Parameter], values: Mapping[str, Any], missing: bool = True
 ) -> None:
     """Refuses unknown names, and if asked missing ones; see :func:`arguments`."""
-    named = [p for p in known.values() if p.kind in NAMED]
-    names = [p.name for p in named]
-    takes_any = any(p.kind is p.VAR_KEYWORD for p in known.values())
-    for name in values:
-        if name not in names and not takes_any:
-            available = f"there are: {', '.join(names)}" if names else "there are none"
-            raise ArgumentError(f"{name}: unknown; {available}")
-    for parameter in named:
-        if missing and parameter.default is parameter.empty and parameter.name not in values:
-            raise ArgumentError(f"{parameter.name}: missing")
+    named = {name: p for name, p in known.items() if p.kind in NAMED}
+    if not any(p.kind is p.VAR_KEYWORD for p in known.values()):
+        refuse_unknown(values, named)
+    for name, parameter in named.items():
+        if missing and parameter.default is parameter.empty and name not in values:
+            raise ArgumentError(f"{name}: missing")
+
+
+def refuse_unknown(names: Iterable[str], known: Iterable[str]) -> None:
+    """Raises an ArgumentError for the first name that is not among those that are known."""
+    known = [*known]
+    for name in names:
+        if name not in known:
+            raise ArgumentError(unknown(name, known))
+
+
+def unknown(name: str, known: Iterable[Any]) -> str:
+    """Returns the line that refuses an unknown name and lists those that there are."""
+    return f"{name}: unknown; there are: {', '.join(map(str, known)) or 'none'}"
 
 
 @contextmanager
@@ -205,9 +213,9 @@ def within(name: str, *others: type[Exception], lead: str | None = None) -> Iter
     """Puts a name and a dot before the lines of argument errors.
 
     Args:
-        name: of the argument, or key of the configuration, that they are within.
-        others: errors that mean bad input, too.
-        lead: what comes before the text of these; None for the name and a colon.
+        name: of an argument, or a key of the configuration, whose entries are read inside.
+        others: further errors that mean bad input.
+        lead: put before the messages of these; None for the name and a colon.
 
     Raises:
         ArgumentError: with that line.
@@ -226,7 +234,7 @@ def within(name: str, *others: type[Exception], lead: str | None = None) -> Iter
 def _checked_values(function: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
     adapters = _adapters(function)
     read = dict(values)
-    for name, adapter in adapters.items():  # in the signature's order: the first is told
+    for name, adapter in adapters.items():  # in the order of the signature
         if name in values and adapter is not None:
             read[name] = _read(name, values[name], adapter)
     return read
@@ -247,7 +255,7 @@ def _adapters(function: Callable[..., Any]) -> dict[str, TypeAdapter[Any] | None
 
 
 def _adapter(hint: Any) -> TypeAdapter[Any] | None:
-    """Returns what reads values of a type; None for any, or one unknown to pydantic."""
+    """Returns an adapter that validates values of a type; None for a type unknown to pydantic."""
     if hint in (Any, object):
         return None
     for config in (ConfigDict(allow_inf_nan=False), None):  # a dataclass has its own
@@ -259,10 +267,10 @@ def _adapter(hint: Any) -> TypeAdapter[Any] | None:
 
 
 def plain(value: Any) -> Any:
-    """Returns a value of NumPy's, torch's, pandas' or OmegaConf's as Python's own.
+    """Returns a value of NumPy, torch, pandas or OmegaConf as Python's own.
 
-    Numbers, texts and truth values become Python's, arrays, series and ranges lists, mappings
-    dicts, and so does what is in them. A tuple stays one, and so does whatever else there is.
+    Scalars become Python's, arrays, series and ranges become lists, mappings become dicts, also
+    within each other. Tuples and values of other types stay as they are.
 
     Example:
         >>> import numpy as np
@@ -280,16 +288,16 @@ def plain(value: Any) -> Any:
 
 
 def shown(value: Any) -> str:
-    """Returns a value as errors show it: in one line of at most 80 characters."""
+    """Returns a value as errors print it: in one line of at most 80 characters."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def whole(name: str, value: Any, least: int | None = None) -> int:
-    """Returns a whole number, of whichever library, as Python's own.
+    """Returns a whole number of any library as Python's own.
 
     Raises:
-        ArgumentError: naming it, if it is none, or smaller than the least.
+        ArgumentError: naming it, if it is no whole number, or smaller than the least one allowed.
     """
     allowed = "must be a whole number" + ("" if least is None else f", at least {least}")
     try:
@@ -307,7 +315,7 @@ def _read(name: str, value: Any, adapter: TypeAdapter[Any]) -> Any:
     except (TypeError, ValueError, RecursionError):
         text = None
     try:
-        # As JSON, pydantic can be strict: true is no number, "3" neither, but a list is a tuple.
+        # Of JSON pydantic can be strict about numbers and still take a list for a tuple.
         if text is not None:
             return adapter.validate_json(text, strict=True)
         return adapter.validate_python(value, strict=True)
@@ -316,8 +324,8 @@ def _read(name: str, value: Any, adapter: TypeAdapter[Any]) -> Any:
 
 
 def _first_line(error: ValidationError, name: str, value: Any) -> str:
-    # The first that is wrong; of a union each member says something, and those that went deepest
-    # into the value know most of it.
+    # Each member of a union has an error. The one that is deepest in the value is the most precise;
+    # where several are equally deep, all their messages are told.
     all_ = [(details, *_place(details, value)) for details in error.errors()]
     within = [one for one in all_ if one[1][: len(all_[0][1])] == all_[0][1]]
     details, loc, folder = max(within, key=lambda one: len(one[1]))
@@ -326,22 +334,21 @@ def _first_line(error: ValidationError, name: str, value: Any) -> str:
     message, *others = dict.fromkeys(f"{line[0].lower()}{line[1:]}" for line in lines)
     message += "".join(f", or {other.removeprefix(SHOULD)}" for other in others)
     if details["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        known = ", ".join(sorted(map(str, folder.keys() - {loc[-1]})))
-        return f"{key}: unknown" + (f"; there are: {known}" if known else "")
+        return unknown(key, sorted(map(str, folder.keys() - {loc[-1]})))
     if details["type"] == "missing":
         return f"{key}: missing"
     return f"{key}={shown(details['input'])}: {message}"
 
 
 def _place(details: Any, value: Any) -> tuple[list[int | str], Any]:
-    """Returns where in a value something is wrong, and the innermost container around it."""
+    """Returns the keys that lead to an error in a value, and the innermost container around it."""
     loc: list[int | str] = []
     folder = inner = value
     for part in details["loc"]:
         try:
             folder, inner = inner, inner[part]
         except (LookupError, TypeError):
-            if details["type"] != "missing":  # a union's member is named, too, and is no key
+            if details["type"] != "missing":  # this part is no key: it names a member of a union
                 continue
         loc.append(part)
     return loc, folder

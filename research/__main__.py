@@ -12,8 +12,8 @@ NAMES = {
     "intervals": "how often intervals over few seeds hold what they are of",
     "slurm": "runs under a real Slurm of one node: time-outs, preemption, scancel",
     "prompts": "curricula of prompts for tiny language models, at equal rollouts",
+    "loops": "curricula in training loops of TorchRL's stock parts",
     "scores": "finished runs on further levels, as a table of methods",
-    "publish": "finished runs as a study, for a repository",
     "pages": "the pages of a study: which curriculum to use, and which claims hold",
 }
 

@@ -15,10 +15,10 @@ import pandas as pd
 from matplotlib.figure import FigureBase
 from numpy.typing import NDArray
 
+from proposer_rl.report.publish import MARK
 from proposer_rl.report.statistics import Interval, difference_of, holm, mean_of, median_interval
 from proposer_rl.report.style import Drawing, finish, in_few_colours, looks, render, style
 from proposer_rl.runs.folder import write_atomically
-from research.publish import MARK
 from research.tiny_lm import CELLS, FAMILIES, LEVELS
 
 Array = NDArray[np.float64]

@@ -153,7 +153,7 @@ def serve() -> None:
         values = json.loads(line)
         values["signal_at"] = {int(k): v for k, v in values["signal_at"].items()}
         request = Request(**values)
-        composing.prepare(tuple(given for given in request.arguments if given[0] == "+"))
+        composing.prepare(tuple(given[1:] for given in request.arguments if given[0] == "+"))
         print(json.dumps(vars(_fork(request))), flush=True)
 
 

@@ -19,8 +19,8 @@ from proposer_rl.experiment.continued import ContinuedLevels
 from proposer_rl.experiment.loop import SideBySide
 from proposer_rl.learning import PPOSettings, RolloutCollector, SolverSettings
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.gymnasium.answers import SuccessSettings
 from proposer_rl.tasks.gymnasium.batched_env import plays
+from proposer_rl.tasks.gymnasium.environment import SuccessSettings
 from proposer_rl.tasks.gymnasium.player import LevelPlayer
 from tests.same_run import assert_same_run
 from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, walk_task

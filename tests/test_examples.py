@@ -20,6 +20,7 @@ from proposer_rl.meta.rewards import TrainingStep
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
 from tests.commands import SMOKE
+from tests.curricula.test_contract import same
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
@@ -133,6 +134,28 @@ def test_learners_of_ones_own_train_in_the_meta_environment(example: Load) -> No
     error = (numbers + 1) / 2 - 1 / 3
     expected = 0.3 * torch.tensor([1.0, 2.0]).unsqueeze(1) * error
     torch.testing.assert_close(learner.agent[0], expected)
+
+
+def test_a_proposer_of_ones_own_trains_solvers_that_begin_anew(
+    example: Load, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the first and in the third cycle; the second goes on from the first replica."""
+    own, begun, ended = example("stock_proposer"), [], []
+    fork = own.SolverTrainingEnv.fork
+
+    def remembered(env, solver: TensorDict, streams: Streams) -> None:
+        begun.append(solver.clone().to_dict())
+        ended.append(env.solvers.snapshot()[0].to_dict())  # of the cycle before
+        fork(env, solver, streams)
+
+    for name, size in {"UPDATES": 2, "STEPS": 2, "CYCLES_OF_A_SOLVER": 2}.items():
+        monkeypatch.setattr(own, name, size)
+    monkeypatch.setattr(own.SolverTrainingEnv, "fork", remembered)
+    own.main(3)
+    _, first, second, third = begun  # the environment's own is the first of all
+    assert len(numbers(capsys.readouterr().out, r"return (\S+),")) == 3
+    assert same(second, ended[2]) and not same(second, first)
+    assert same(third, own.new_solver(own.small_task(), 2).to_dict()) and not same(third, ended[3])
 
 
 @pytest.mark.slow

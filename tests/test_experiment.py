@@ -23,6 +23,7 @@ from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl
 from proposer_rl.runs.process import Interrupted, StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels, NoSuccessError, Task
+from proposer_rl.tasks.mazes.levels import shortest_path_length
 from proposer_rl.teaching import Teacher
 from tests.curricula.made import MADE
 from tests.same_run import StopAt, assert_same_run, tables
@@ -80,7 +81,11 @@ def test_a_run_is_a_plain_loop_of_updates(plain: tuple[Experiment, dict, Path]) 
     assert summary["updates_to_threshold"] == [first]
     assert summary["frames"] == 5 * P * T
     assert summary["curriculum_frames"] == summary["evaluations"] == 0
-    assert not (folder / "cycles.jsonl").exists()
+    # The target is the last of the four bins, and nothing else is told of a cycle.
+    cycles = read_jsonl(folder / "cycles.jsonl")
+    assert [row["histogram"] for row in cycles] == [[[0, 0], [0, n * P]] for n in (2, 2, 1)]
+    costs = {"curriculum_frames": 0, "evaluations": 0}
+    assert [{**costs, **row} for row in cycles] == cycles and len(cycles[0]) == 5
 
 
 def test_a_teacher_in_a_plain_loop_trains_the_same_solvers(tmp_path: Path) -> None:
@@ -239,7 +244,46 @@ def test_what_a_curriculum_costs_is_counted_written_and_survives(
         row["own"] = ["improved"]
     for row, observed in zip(expected[1:], (2, 2, 1), strict=True):
         row["observed"] = observed
+        row["histogram"] = [[0, 0], [0, observed * P]]
     assert cycles == expected
+
+
+def test_where_the_levels_of_a_cycle_lie_is_recorded(tmp_path: Path) -> None:
+    """Of levels that no curriculum's own record tells; in a run that goes on, too."""
+    for updates in (3, 5):
+        uniform = SamplingCurriculum(TASK.space)
+        experiment(tmp_path, 3, curriculum=uniform, updates=updates, cycle_length=4).run()
+    expected = np.zeros((2, 2), int)
+    for update in range(5):
+        if update == 4:
+            expected[:] = 0
+        stream = Streams(3, "update", update).generator("levels")
+        for level in TASK.space.sample(P, stream):
+            far = int(shortest_path_length(level)) > 3  # of 2 and 4
+            expected[int(float(level.walls.float().mean()) > 0.1), int(far)] += 1
+        if update == 3:
+            first = expected.tolist()
+    rows = [row["histogram"] for row in read_jsonl(tmp_path / "cycles.jsonl")]
+    assert rows == [first, expected.tolist()]
+
+
+def test_what_a_curriculum_tells_of_its_proposals_stays(tmp_path: Path) -> None:
+    class Tells(SamplingCurriculum):
+        def log(self) -> dict:
+            return {"histogram": [[1, 2], [3, 4]]}
+
+    experiment(tmp_path, 0, curriculum=Tells(TASK.target)).run()
+    assert read_jsonl(tmp_path / "cycles.jsonl")[-1]["histogram"] == [[1, 2], [3, 4]]
+
+
+def test_a_longer_schedule_goes_on_as_if_it_had_been_so_long_from_the_start(
+    tmp_path: Path,
+) -> None:
+    experiment(tmp_path / "whole", 0, curriculum=Costly(), updates=7).run()
+    experiment(tmp_path / "run", 0, curriculum=Costly(), updates=5).run()
+    experiment(tmp_path / "run", 0, curriculum=Costly(), updates=7).run()
+    rows = [read_jsonl(tmp_path / name / "cycles.jsonl") for name in ("whole", "run")]
+    assert rows[0] == rows[1]
 
 
 def test_levels_that_a_curriculum_shows_are_recorded(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ def test_a_proposer_observes_what_the_task_tells() -> None:
     task = copy.copy(TASK)
     task.performance = lambda *given: TASK.performance(*given).exclude("success")
     chosen = ProposerSettings(rollouts=2, validation_levels=4, probe_levels=2)
-    said = r"^proposer\.observes=\['log_success', 'progress'\]: this task does not tell log_success"
+    said = r"^proposer\.observes=\['log_success', 'progress'\]: this task has no log_success"
     with pytest.raises(ValueError, match=said):
         proposer(Components(task, chosen, 0), reward=performance_gain)
 

@@ -88,7 +88,7 @@ def own_addresses() -> set[str]:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere"], "nowhere: is no run's folder: it has no config.json"),
+        (["nowhere"], "nowhere: is not a run's folder: it has no config.json"),
         (["fresh"], "fresh: holds no checkpoints; give a run's folder or a checkpoint"),
         (["{run}", "--port", "65536"], "must be a whole number from 0 to 65,535, got '65536'"),
     ],

@@ -1,4 +1,4 @@
-"""From the configuration to an experiment: nothing is written here, wrong input ends here."""
+"""Builds the parts of an experiment from its configuration, without writing anything."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 import torch
 
 from proposer_rl.cli.config import RunConfig, task_maker
-from proposer_rl.cli.errors import ConfigError, one_line
+from proposer_rl.cli.errors import ConfigError
 from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, require
 from proposer_rl.experiment import Experiment, Log, check_headline
 from proposer_rl.extras import require_package
 from proposer_rl.learning import PPO, SolverSettings
 from proposer_rl.meta.assembly import Components, Workers
 from proposer_rl.meta.workers import WorkerSettings
-from proposer_rl.methods import CANNOT_BE_CALLED
+from proposer_rl.methods import INPUT_ERRORS
 from proposer_rl.methods import build as build_curriculum
 from proposer_rl.models import available_cores, check_torch_defaults, use_device
 from proposer_rl.runs.folder import RunFolder
@@ -35,7 +35,7 @@ class Made(NamedTuple):
 
 
 def parts(config: RunConfig, signals: StopSignals, status: Status | None = None) -> Made:
-    """Makes task, Solvers and their curricula; nothing is written yet."""
+    """Builds the task, the Solvers and their curricula."""
     if config.logger.type != "csv":
         require_package(f"logger={config.logger.type}", config.logger.type, config.logger.type)
     task = make_task(config)
@@ -44,7 +44,7 @@ def parts(config: RunConfig, signals: StopSignals, status: Status | None = None)
     with within("schedule"):
         check_headline(task, config.schedule)
     curricula = [_curriculum(config, task, seed, signals, status) for seed in config.seeds]
-    with within("curriculum", *CANNOT_BE_CALLED):
+    with within("curriculum", *INPUT_ERRORS):
         require(TaskStudent(task, learner), curricula[0].needs, f"method={config.method}")
     return Made(task, learner, curricula)
 
@@ -57,7 +57,7 @@ def build(
     status: Status | None = None,
     log: Log | None = None,
 ) -> Experiment:
-    """Returns the experiment of the parts that :func:`parts` has made."""
+    """Returns the experiment of the parts that :func:`parts` has built."""
     return Experiment(
         *made,
         schedule=config.schedule,
@@ -71,7 +71,7 @@ def build(
 
 
 def make_task(config: RunConfig) -> Task:
-    """Returns the task of a run, on its device and with its number of threads."""
+    """Builds the task of a run on its device, and sets torch's number of threads."""
     compute = config.compute
     device = _device(compute.device)
     if compute.threads is not None:
@@ -86,15 +86,15 @@ def make_task(config: RunConfig) -> Task:
     check_torch_defaults()  # an environment's module may have set them as it was imported
     if task.device.type != device.type:
         warnings.warn(
-            f"this run is computed on {task.device.type} instead of {device.type}, since that is "
-            "where the task makes its levels",
+            f"the run is computed on {task.device.type} instead of {device.type}, where the task "
+            "makes its levels",
             stacklevel=2,
         )
     return task
 
 
 def _made(maker: partial[Any], solver: SolverSettings, context: ComputeContext, device: str) -> Any:
-    """Returns the task on a device; workers call it, too."""
+    """Builds the task on a device; workers call this, too."""
     use_device(torch.device(device))
     return maker(solver=solver, context=context._replace(device=torch.device(device)))
 
@@ -114,14 +114,14 @@ def _curriculum(
     learned = isinstance(curriculum, LearnedCurriculum) and curriculum.trains_replicas
     if workers is not None and not learned:
         raise ConfigError(
-            f"compute.collector={config.compute.collector}: this method trains no replicas "
-            "that workers could have; leave compute.collector=single"
+            f"compute.collector={config.compute.collector}: this method trains no replicas in "
+            "workers; leave compute.collector=single"
         )
     return curriculum
 
 
 def _workers(config: RunConfig, task: Task) -> Workers | None:
-    """Returns where the replicas are trained; None for this process."""
+    """Returns the workers in which replicas are trained; None for this process."""
     compute, copies = config.compute, config.proposer.rollouts
     if compute.collector == "single":
         return None
@@ -131,7 +131,7 @@ def _workers(config: RunConfig, task: Task) -> Workers | None:
     gpus = torch.cuda.device_count()
     count = compute.workers or min(copies, gpus if on_gpus else available_cores())
     devices = compute.worker_devices or [task.device.type]
-    if compute.collector == "multiprocess":  # Ray shows a worker only those that it reserved
+    if compute.collector == "multiprocess":  # Ray assigns devices to its workers itself
         if on_gpus and compute.worker_devices is None:
             devices = [f"cuda:{index}" for index in range(gpus)]
         devices = [str(_device(name, "worker_devices")) for name in devices]
@@ -147,12 +147,7 @@ def _workers(config: RunConfig, task: Task) -> Workers | None:
 def _device(name: str, key: str = "device") -> torch.device:
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
-    try:
+    with within(f"compute.{key}", RuntimeError, AssertionError, lead=f"compute.{key}={name}: "):
         probe = torch.ones(1, device=name)
         probe.item()  # the device "meta" computes nothing
-        return probe.device
-    except (RuntimeError, AssertionError) as error:
-        reason = one_line(error)[:120]
-        raise ConfigError(
-            f"compute.{key}={name!r}: must be auto, cpu or a usable one: {reason}"
-        ) from error
+    return probe.device

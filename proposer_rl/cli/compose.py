@@ -1,4 +1,4 @@
-"""A run in a process that is not Hydra's: what ``prl.train`` calls."""
+"""Composes and carries out a run for ``prl.train``, without Hydra's command line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from proposer_rl.cli.config import RunConfig, read_config
-from proposer_rl.cli.groups import Invocation, check_groups, python_path
+from proposer_rl.cli.groups import Invocation, check_scale, python_path
 from proposer_rl.cli.run import carry_out
 from proposer_rl.cli.watch import show_run
 from proposer_rl.recipes import composed, plain_values, storable
@@ -23,12 +23,12 @@ from proposer_rl.runs.process import StopSignals
 def compose_and_run(
     words: Sequence[str], settings: Sequence[Mapping[str, Any]], folder: Path | None
 ) -> Path:
-    """Trains as ``bin/train`` with these settings does; threads may call it side by side.
+    """Trains as ``bin/train`` does with the same settings; several threads may call it at once.
 
     Args:
-        words: names of files, as on the command line.
-        settings: by top-level key, merged into what the files have; later ones win.
-        folder: the run's; None for a new one below ``outputs/``.
+        words: overrides of Hydra's that choose files.
+        settings: by top-level key, merged into those of the files; of two the later one counts.
+        folder: of the run; None for a new one below ``outputs/``.
 
     Returns:
         The run's folder, absolute.
@@ -37,7 +37,7 @@ def compose_and_run(
         ArgumentError: naming the first wrong key, its value and what is allowed.
         Interrupted: if a signal asked the run to stop; all is saved then.
     """
-    check_groups(words)
+    check_scale(words)
     own = [{key: storable(key, value) for key, value in some.items()} for some in settings]
     config = read_config(composed(words, *own))
     asked = plain_values(OmegaConf.merge({}, *own))
@@ -49,7 +49,7 @@ def compose_and_run(
 
 
 def _new_folder(config: RunConfig) -> Path:
-    """Makes a folder for a run that was given none."""
+    """Creates a folder for a run."""
     parent = Path("outputs") / config.method
     first = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_seed_{config.seed}"
     for name in chain([first], (f"{first}_{number}" for number in count(2))):

@@ -1,4 +1,4 @@
-"""From Hydra's composed configuration to checked settings, with one-line errors."""
+"""Validates the configuration that Hydra has composed, and the one that a run has stored."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Le, Len
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 
-from proposer_rl.cli.errors import ConfigError, settings_file
+from proposer_rl.cli.errors import ConfigError, one_line, settings_file
 from proposer_rl.experiment import ScheduleSettings
 from proposer_rl.learning import SolverSettings
 from proposer_rl.meta.assembly import ProposerSettings
-from proposer_rl.methods import CANNOT_BE_CALLED, completed
+from proposer_rl.methods import INPUT_ERRORS, completed
 from proposer_rl.recipes import maker
 from proposer_rl.runs.folder import storage
 from proposer_rl.settings import arguments, settings, within
 
-# What a task's maker is given beside the task's own settings.
+# The function that makes a task gets these arguments beside the task's own settings.
 GIVEN_TO_TASKS = ("solver", "context")
 
 
 @settings
 class HandDesignedSettings:
-    """A hand-designed curriculum.
+    """The stages of a hand-designed curriculum.
 
     Attributes:
-        distributions: of the task, in order.
+        distributions: names of the task's, in order.
         until: updates after which each but the last ends.
     """
 
@@ -41,12 +41,12 @@ class HandDesignedSettings:
 
 @settings
 class PoolSettings:
-    """Settings of curricula that keep levels: how many, and among how many they choose.
+    """How many levels curricula keep, and among how many they choose.
 
     Attributes:
-        capacity: levels of a buffer.
-        candidates: levels that are scored to keep some of them.
-        keep: of the candidates.
+        capacity: of a buffer of levels.
+        candidates: levels that are scored at once.
+        keep: how many of the candidates are kept.
         simplest: values of the space's axes with the easiest bins; None for all bins.
     """
 
@@ -58,11 +58,11 @@ class PoolSettings:
 
 @settings
 class LoggerSettings:
-    """Settings of the logger that gets rows of metrics besides the run's folder.
+    """Where metrics are logged besides the run's folder.
 
     Attributes:
-        type: ``csv`` for nowhere.
-        project, mode: of Weights & Biases; None for what its own variables say, WANDB_PROJECT and
+        type: ``csv`` for the run's folder alone.
+        project, mode: of Weights & Biases; None for its environment variables WANDB_PROJECT and
             WANDB_MODE, or else ``proposer_rl`` and ``online``.
     """
 
@@ -73,16 +73,17 @@ class LoggerSettings:
 
 @settings
 class ComputeSettings:
-    """Settings of where a run is computed, which change no numbers beyond rounding.
+    """Where and how a run is computed; changes no numbers beyond rounding.
 
     Attributes:
-        device: ``auto``: cuda where there is one, else cpu.
-        graphs: replay on a GPU what can be recorded as CUDA graphs.
-        compile: have torch.compile fuse gradient steps, on a GPU.
-        threads: CPU threads of one operation; None leaves torch's choice.
+        device: ``auto`` for cuda where it is available, else cpu.
+        graphs: on a GPU, replay updates and evaluations as CUDA graphs.
+        compile: on a GPU, fuse gradient steps by torch.compile.
+        threads: CPU threads of one operation; None for torch's default.
         cores: replicas of the Solver computed at once on a CPU; None for all cores.
-        collector: where a Proposer's copies are trained: in this process, in several, or by Ray.
-        workers: processes for them; None for one for each GPU, or core, at most one for each copy.
+        collector: where a Proposer's replicas are trained: in this process, in several, or by Ray.
+        workers: processes for the replicas; None for one for each GPU or core, at most one for each
+            replica.
         worker_devices: of the workers, in turn; None for all GPUs, or the CPU.
         ray_address: of a Ray cluster, such as auto or 10.0.0.1:6379; None for one on this machine.
         progress: draw progress bars.
@@ -102,9 +103,9 @@ class ComputeSettings:
 
 @settings
 class RunConfig:
-    """Every setting of a run; names and meaning as in ``conf/train.yaml``.
+    """All settings of a run; names and meaning as in ``conf/train.yaml``.
 
-    What joins several settings is checked where the object is built that needs it.
+    Rules that join several settings are checked where the object is built that uses them.
     """
 
     method: str
@@ -118,7 +119,7 @@ class RunConfig:
     seed: Annotated[int, Ge(0)]
     seeds: Annotated[list[Annotated[int, Ge(0)]], Len(1)]
     precision: Literal["auto", "fp32", "bf16"]
-    schedule: ScheduleSettings  # others refer to it
+    schedule: ScheduleSettings
     hand_designed: HandDesignedSettings
     pool: PoolSettings
     solver: SolverSettings
@@ -128,23 +129,21 @@ class RunConfig:
 
 
 def read_config(config: DictConfig) -> RunConfig:
-    """Checks a composed configuration and returns it as settings, with all defaults."""
+    """Validates a composed configuration and returns it as settings, with all defaults."""
     if isinstance(config.get("task"), DictConfig) and "_target_" not in config.task:
-        maker("task", {})  # before interpolations find less than what a task brings
+        maker("task", {})  # refuses it, before references to the task's settings cannot be resolved
     try:
         values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
-        missing = isinstance(error, MissingMandatoryValue)
-        reason = "missing" if missing else str(error).splitlines()[0]
-        raise ConfigError(f"{error.full_key}: {reason}") from error
+        raise ConfigError(one_line(error)) from error
     values = completed(values)
-    if isinstance(values.get("task"), dict):  # before what is made of its values elsewhere
+    if isinstance(values.get("task"), dict):  # first, since other settings refer to its values
         task_maker(values["task"])
     read = RunConfig(**arguments(RunConfig, values))
     if read.checkpoint is not None and read.checkpoint not in read.curriculum.values():
         raise ConfigError(
-            f"checkpoint={read.checkpoint}: method={read.method} takes none; "
-            "those with a Proposer do, and a run goes on with hydra.run.dir=FOLDER"
+            f"checkpoint={read.checkpoint}: has no effect with method={read.method}, which has no "
+            "Proposer; to resume a run, give hydra.run.dir=FOLDER"
         )
     if len(set(read.seeds)) < len(read.seeds):
         raise ConfigError(f"seeds={read.seeds}: must be distinct")
@@ -160,34 +159,32 @@ def read_config(config: DictConfig) -> RunConfig:
 
 
 def task_maker(values: Mapping[str, Any]) -> partial[Any]:
-    """Returns a function that makes the task of these settings from ``solver`` and ``context``."""
+    """Validates a task's settings; returns its function of ``solver`` and ``context``."""
     make, own = maker("task", values)
     lead = f"task._target_={values['_target_']}: "
-    with within("task", *CANNOT_BE_CALLED, lead=lead):
+    with within("task", *INPUT_ERRORS, lead=lead):
         return partial(make, **arguments(make, own, GIVEN_TO_TASKS))
 
 
 def saved_config(folder: Path) -> RunConfig:
-    """Returns the settings of the run in a folder; where it is computed is left to choice."""
+    """Returns the settings of the run in a folder, except where it was computed."""
     file = settings_file(folder)
     return checked_config(stored_config(file), file)
 
 
 def checked_config(values: Mapping[str, Any], file: Path) -> RunConfig:
-    """Returns settings as a run stored them; where it is computed is left to choice."""
+    """Returns the settings that a run stored in a file, except where it was computed."""
     free = {"compute": {"threads": 1, "progress": False}, "logger": {"type": "csv"}}
     try:
         return RunConfig(**arguments(RunConfig, {**values, **free}))
-    except (ValueError, TypeError, AttributeError, KeyError) as error:
-        raise ConfigError(
-            f"{file}: does not hold the settings of a run of this version: {error}"
-        ) from error
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"{file}: not the settings of a run of this version: {error}") from error
 
 
 def stored_config(file: Path) -> Any:
-    """Returns the content of a run's ``config.json`` unchecked."""
+    """Returns the content of a run's ``config.json``, not validated."""
     try:
         with storage(file, "read"):
             return json.loads(file.read_bytes())
-    except (ValueError, RecursionError):
-        raise ConfigError(f"{file}: is no JSON") from None
+    except ValueError as error:
+        raise ConfigError(f"{file}: {error}") from error

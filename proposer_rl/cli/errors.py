@@ -1,9 +1,9 @@
 """Errors of the command line and exit codes.
 
-An error that is foreseen is a class with an ``exit_code``; its message is one line. Whatever is
-wrong with what a user gave is a :class:`ConfigError`, in every function of this room.
-docs/reference/exit_codes.md lists the codes: 2 bad input, 3 divergence, 4 storage, 5 a folder in
-use, 6 lost workers; 128 plus its number for a signal; 1, Python's own, for an unforeseen error.
+A foreseen error is a class with an ``exit_code``, and its message is one line. Functions of this
+package raise :class:`ConfigError` for wrong input. docs/reference/exit_codes.md lists the codes:
+2 bad input, 3 divergence, 4 storage, 5 a folder in use, 6 lost workers, 128 plus its number for a
+signal, and 1, Python's own, for an unforeseen error.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Number = TypeVar("Number", int, float)
 
 
 class ConfigError(ValueError):
-    """The configuration is wrong; the message is one line."""
+    """The configuration or another input is wrong; the message is one line."""
 
     exit_code = BAD_INPUT
 
@@ -44,7 +44,7 @@ def command(body: Callable[[], None]) -> None:
 
 
 def say(text: str) -> None:
-    """Prints a text on standard output, above progress bars; it never raises."""
+    """Prints a text on standard output, above progress bars; never raises."""
     from tqdm import tqdm
 
     tqdm.write(text, file=Output(sys.stdout))
@@ -54,7 +54,7 @@ def refuse(error: Exception, folder: Path | None = None) -> NoReturn:
     """Prints an error in one line, as :func:`one_line` does, and exits with its code.
 
     Raises:
-        Exception: the error itself, if it was not foreseen.
+        Exception: the error itself, if it is unforeseen.
     """
     code = exit_code(error)
     if code == UNFORESEEN:
@@ -73,7 +73,7 @@ def exit_code(error: BaseException) -> int:
 
 def lacks_memory(error: BaseException) -> bool:
     """Returns whether an error means that memory was exhausted, on the CPU or a GPU."""
-    # No word that a defect might use, too: that must keep its traceback.
+    # Matches only torch's own words, since other errors must keep their tracebacks.
     torchs = isinstance(error, RuntimeError) and "tried to allocate" in str(error).lower()
     return torchs or isinstance(error, MemoryError)
 
@@ -82,8 +82,8 @@ def one_line(error: BaseException, folder: Path | None = None) -> str:
     """Returns an error's message without line breaks and other control characters.
 
     Args:
-        error: what has happened.
-        folder: that was written to, for an error of the disk that names no file.
+        error: the error.
+        folder: the folder that was written to, for an error of the disk that names no file.
     """
     text = str(error)
     if isinstance(error, OSError) and error.strerror and (place := error.filename or folder):
@@ -96,7 +96,7 @@ def one_line(error: BaseException, folder: Path | None = None) -> str:
 def number(
     kind: Callable[[str], Number], least: float = -math.inf, most: float = math.inf
 ) -> Callable[[str], Number]:
-    """Returns a type for argparse: a finite number in a range."""
+    """Returns a type for argparse that takes finite numbers in a range."""
     allowed = "a whole number" if kind is int else "a number"
     if math.isfinite(most):
         allowed += f" from {least:,} to {most:,}"
@@ -125,5 +125,5 @@ def settings_file(folder: Path) -> Path:
     """Returns the path of a run's ``config.json``; refuses a folder without one."""
     file = folder / "config.json"
     if not file.is_file():
-        raise ConfigError(f"{folder}: is no run's folder: it has no config.json")
+        raise ConfigError(f"{folder}: is not a run's folder: it has no config.json")
     return file

@@ -1,11 +1,11 @@
-"""Reads what a command asks for: overrides, groups, and errors in composing them."""
+"""Reads what a command asks for: its overrides, its groups, and the errors in them."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,19 +16,14 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from proposer_rl.cli.errors import ConfigError
-from proposer_rl.cli.help import GROUPS
 from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, available
 
-# Files that change a method or a scale, and must come after it, since later files win.
-CHANGED = ("method", "scale")
-CHANGING = [group.strip("+=") for group in GROUPS if group.startswith("+")]
-CHANGING = [group for group in CHANGING if group not in (*CHANGED, "sweep")]
-# Keys below which are settings of curricula, most of which are in no file.
+# Below these keys are the settings of curricula, most of which are in no file.
 BUILT = ("curriculum.", "filter.", "model.")
-# What a sweep's folders are not named after: where a run is computed and shown, and what has a
-# place of its own in the name.
+# The folders of a sweep are not named after these: they say where a run is computed and shown, or
+# have a place of their own in the name.
 UNNAMED = {"compute", "logger", "method", "seed", "seeds", "sweep"}
-LONGEST = 120  # characters of a name that come from overrides
+LONGEST = 120  # characters of a folder's name that come from overrides
 
 
 class Invocation(NamedTuple):
@@ -72,27 +67,19 @@ def _from_here(path: str) -> str:
 
 
 def arranged(overrides: Sequence[str]) -> list[str]:
-    """Returns overrides in the order and spelling in which Hydra takes them.
+    """Returns overrides in the spelling in which Hydra takes them.
 
-    Groups that change a method or a scale come after it. Settings that have defaults in Python may
-    be in no file: ``filter.times=8`` is ``++filter.times=8``. A folder in the home folder may begin
-    with ``~``.
+    ``+method=plr`` becomes ``method=plr``, since the groups of ``conf/`` are in the defaults list
+    of ``conf/train.yaml``, which has their order. Settings of a curriculum may have their defaults
+    in Python and be in no file, so ``filter.times=8`` becomes ``++filter.times=8``. A run's or
+    sweep's folder may begin with ``~``, the home folder.
 
     Raises:
         ConfigError: if a group is set to what cannot be a file's name, such as ``task=null``.
         HydraException: if one is not in Hydra's grammar.
     """
     words = [_at_home(word) for word in overrides]
-    return _ordered(map(_spelled, OverridesParser.create().parse_overrides(words)))
-
-
-def _ordered(given: Iterable[str]) -> list[str]:
-    words = list(given)
-    groups = [word.partition("=")[0].lstrip("+") for word in words]
-    end = max((place for place, group in enumerate(groups) if group in CHANGED), default=-1) + 1
-    early = {place for place in range(end) if groups[place] in CHANGING}
-    first = [word for place, word in enumerate(words[:end]) if place not in early]
-    return [*first, *(words[place] for place in sorted(early)), *words[end:]]
+    return [*map(_spelled, OverridesParser.create().parse_overrides(words))]
 
 
 def quoted(key: str, text: str) -> str:
@@ -100,39 +87,40 @@ def quoted(key: str, text: str) -> str:
     with suppress(HydraException):
         if OverridesParser.create().parse_override(f"{key}={text}").value() == text:
             return f"{key}={text}"
-    # Hydra takes backslashes as they are, but for those before a quote: these are doubled.
+    # Hydra takes backslashes as they are, except before a quote, where each must be doubled.
     text = re.sub(r"(\\+)('|\Z)", r"\1\1\2", text).replace("'", r"\'")
     return f"{key}='{text}'"
 
 
 def _at_home(word: str) -> str:
     key, _, value = word.partition("=")
-    home = value.startswith("~") and key in ("hydra.run.dir", "hydra.sweep.dir")
-    return quoted(key, str(Path(value).expanduser())) if home else word
+    folder = value.strip("'\"")
+    home = folder.startswith("~") and key in ("hydra.run.dir", "hydra.sweep.dir")
+    return quoted(key, str(Path(folder).expanduser())) if home else word
 
 
 def _spelled(parsed: Override) -> str:
-    """Returns an override as Hydra takes it, see :func:`arranged`."""
+    """Returns an override as Hydra takes it; see :func:`arranged`."""
     word, group = str(parsed.input_line), parsed.key_or_group
     if word.startswith(BUILT):
         return f"++{word}"
-    if (CONFIG_FOLDER / group).is_dir() and not parsed.is_delete():
-        value: Any = parsed.value()
-        values = value.list if parsed.is_choice_sweep() else [value]
-        if any(value is None or isinstance(value, int | float) for value in values):
-            choices = ", ".join(available(group))
-            raise ConfigError(f"{word}: names no file; choose one of: {choices}")
-    return word
+    if not (CONFIG_FOLDER / group).is_dir() or parsed.is_delete():
+        return word
+    value: Any = parsed.value()
+    values = value.list if parsed.is_choice_sweep() else [value]
+    if any(value is None or isinstance(value, int | float) for value in values):
+        raise ConfigError(f"{word}: names no file; choose one of: {', '.join(available(group))}")
+    return word.lstrip("+")
 
 
 def settings_name(overrides: ListConfig) -> str:
-    """Returns what the folder of a run in a sweep is called after: the settings that were given.
+    """Returns the part of a run's folder in a sweep that names the settings given on the command.
 
-    It depends on neither their order nor on what else is in the sweep. Behind a name that is cut,
-    or whose signs no folder can have, stands a digest of the whole.
+    It depends neither on their order nor on what else is in the sweep. A name that was cut, or that
+    has characters which a folder cannot have, ends in a digest of the whole.
 
     Example:
-        >>> settings_name(OmegaConf.create(["+method=plr", "seed=1", "+scale=quick", "x.y=8"]))
+        >>> settings_name(OmegaConf.create(["method=plr", "seed=1", "scale=quick", "x.y=8"]))
         'scale=quick,x.y=8'
     """
     given: Any = OmegaConf.to_container(overrides)
@@ -144,10 +132,10 @@ def settings_name(overrides: ListConfig) -> str:
     return name if name == whole else f"{name}-{digest}"
 
 
-# ${joined:${seeds}} in the configuration: 0, or 0-1-2 where seeds are trained together.
+# ${joined:${seeds}} in the configuration is 0, or 0-1-2 where seeds are trained side by side.
 OmegaConf.register_new_resolver(
     "joined",
-    # What is no list is refused later, in a line that names its key.
+    # A value that is no list is refused later, in a line that names its key.
     lambda items: "-".join(map(str, items)) if isinstance(items, ListConfig) else str(items),
     replace=True,
 )
@@ -158,21 +146,17 @@ OmegaConf.register_new_resolver(
 )
 
 
-def check_groups(given: Sequence[str]) -> None:
-    """Refuses a scale of another task, and groups that would be undone, since later ones win."""
-    said = dict(override.split("=", 1) for override in given if "=" in override)
-    task, scale = said.get("task"), said.get("+scale")
+def check_scale(overrides: Sequence[str]) -> None:
+    """Refuses a scale, which is of the default task, for another task of ``conf/``."""
+    said = dict(override.split("=", 1) for override in overrides if "=" in override)
+    task, scale = said.get("task"), said.get("scale")
     if task in available("task") and scale in available("scale"):
         defaults = OmegaConf.load(CONFIG_FOLDER / "train.yaml").defaults
         scaled = next(group.task for group in defaults if "task" in group)
         if task != scaled:
             raise ConfigError(
-                f"+scale={scale}: is of task={scaled}; task={task} has numbers of its own"
+                f"scale={scale}: is a scale of task={scaled}; task={task} has sizes of its own"
             )
-    if _ordered(given) != [*given]:  # a sweep's file has its own order
-        raise ConfigError(
-            f"{' '.join(given)}: +method and +scale must come before what changes them"
-        )
 
 
 def check_chosen(config: DictConfig, hydra: Any) -> None:
@@ -180,9 +164,6 @@ def check_chosen(config: DictConfig, hydra: Any) -> None:
 
     Hydra puts it there where the first line of a user's file is missing.
     """
-    if config.method is None or config.curriculum is None:
-        known = ", ".join(available("method"))
-        raise ConfigError(f"method: missing; choose one with +method=NAME, NAME one of: {known}")
     for group, name in hydra.runtime.choices.items():
         below = config.get(group)
         if isinstance(below, DictConfig) and group in below:
@@ -190,3 +171,6 @@ def check_chosen(config: DictConfig, hydra: Any) -> None:
                 f"{group}={name}: the first line of {group}/{name}.yaml must be '# @package "
                 "_global_', with no byte-order mark before it"
             )
+    if config.method is None or config.curriculum is None:
+        known = ", ".join(available("method"))
+        raise ConfigError(f"method: missing; choose one with +method=NAME, NAME one of: {known}")

@@ -1,4 +1,4 @@
-"""``bin/train --help``: what there is to choose from."""
+"""Prints ``bin/train --help`` with the names of all files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Examples:
   bin/train +method=perf_gain +scale=quick --cfg job   # every setting; nothing is run
 
 -m runs every combination; --hydra-help lists the other options, all of them Hydra's."""
-# In the order in which they are given on the command line, and what each decides.
+# What each group decides, in the usual order on the command line.
 GROUPS = {
     "task=": "what is to be learnt",
     "+method=": "what the Solver trains on",
@@ -36,7 +36,7 @@ NEEDS, NOTHING = "Needs: ", "nothing."
 
 
 def help_text(arguments: Sequence[str]) -> str:
-    """Returns usage, the names in each group, also of ``--config-dir``, and examples."""
+    """Returns the usage, the names in each group, including ``--config-dir``, and examples."""
     folders = [CONFIG_FOLDER, *own_folders(arguments)]
     parts = [USAGE]
     for option, meaning in GROUPS.items():
@@ -52,8 +52,7 @@ def choices(group: str, folders: Sequence[Path]) -> dict[str, str]:
 
     Args:
         group: such as ``method``.
-        folders: of configurations; of two files with one name the first folder's counts, as in
-            Hydra.
+        folders: of configurations; of two files with the same name the first counts, as in Hydra.
     """
     found: dict[str, str] = {}
     for folder in folders:
@@ -63,7 +62,7 @@ def choices(group: str, folders: Sequence[Path]) -> dict[str, str]:
 
 
 def needs(folders: Sequence[Path]) -> dict[str, list[str]]:
-    """Returns what methods need, by name, where their files have a line ``# Needs:``."""
+    """Returns what methods need, by name, from the lines ``# Needs:`` of their files."""
     found: dict[str, list[str]] = {}
     for folder in folders:
         for name in available("method", folder):

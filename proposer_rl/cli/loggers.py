@@ -1,4 +1,4 @@
-"""Numbers of a run's tables to TensorBoard or Weights & Biases."""
+"""Logs the numbers of a run's tables to TensorBoard or Weights & Biases."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Write = Callable[[Mapping[str, float], int], None]
 def logger(
     settings: LoggerSettings, path: Path, name: str, config: Mapping[str, Any]
 ) -> Iterator[Log | None]:
-    """Yields a function that logs rows of a run's tables; None where the run's folder is enough."""
+    """Yields a function that logs rows of a run's tables; None if no logger is asked for."""
     if settings.type == "csv":
         yield None
         return
@@ -50,13 +50,13 @@ def _tensorboard(folder: Path, config: Mapping[str, Any]) -> Iterator[Write]:
         def write(found: Mapping[str, float], step: int) -> None:
             nonlocal writer
             if writer is None:
-                # What an interrupted run has written from its checkpoint on comes again.
+                # A resumed run repeats the rows that were written after its checkpoint.
                 writer = stack.enter_context(SummaryWriter(folder, purge_step=step))
                 for key, value in config.items():
                     writer.add_text(f"config/{key}", str(value), step)
             for key, value in found.items():
                 writer.add_scalar(key, value, step)
-            writer.flush()  # so that it is seen during the run
+            writer.flush()  # so that they can be seen during the run
 
         yield write
 
@@ -65,7 +65,7 @@ def _tensorboard(folder: Path, config: Mapping[str, Any]) -> Iterator[Write]:
 def _wandb(
     settings: LoggerSettings, path: Path, name: str, config: Mapping[str, Any]
 ) -> Iterator[Write]:
-    """Yields a function that writes to W&B; its variables hold where the settings say nothing."""
+    """Yields a function that writes to W&B, whose variables count where a setting is None."""
     import wandb
 
     run = wandb.init(
@@ -76,11 +76,11 @@ def _wandb(
         id=wandb_id(path),
         resume="allow",
         config=dict(config),
-        reinit="create_new",  # a run of the caller's own goes on
+        reinit="create_new",  # beside a run that the caller may have
     )
     code = 1
     try:
-        # All that comes of one update is one row. A run that goes on repeats rows, which are there.
+        # The rows of one update become one step. W&B ignores steps that a resumed run repeats.
         yield lambda found, step: run.log(dict(found), step=step)
         code = 0
     finally:
@@ -88,7 +88,7 @@ def _wandb(
 
 
 def wandb_id(path: Path) -> str:
-    """Returns the id of a run at Weights & Biases, which a resumed run finds in its folder."""
+    """Returns a run's id at Weights & Biases, which is kept in its folder for resuming."""
     file = path / ID
     if not file.is_file():
         write_atomically(file, secrets.token_hex(4).encode())
@@ -96,7 +96,7 @@ def wandb_id(path: Path) -> str:
 
 
 def _numbers(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    """Yields a row's numbers, maximum and mean of its lists of numbers, and its batch shares."""
+    """Yields the numbers of a row, the maximum and mean of its lists, and its batch shares."""
     for key, value in row.items():
         if isinstance(value, int | float):
             yield key, value

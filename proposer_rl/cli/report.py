@@ -1,4 +1,4 @@
-"""``bin/report`` and ``proposer-report``: tables, figures and a page from folders of runs."""
+"""``bin/report`` and ``proposer-report``: a report, or a study to publish, from runs."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ examples:
   bin/report sweeps/quick --baseline target   everything measured against that method
   bin/report outputs --compare perf_gain,plr  one comparison was planned: p corrects for it alone
   bin/report outputs results/medium        your runs beside published ones
+  bin/report sweeps/medium --publish results/medium   a study for a repository, no report
   bin/report plr.jsonl uniform.jsonl       logs of teachers, teacher.log(file)
 
 The output folder gets report.html (one self-contained page), report.md (the same in short),
@@ -39,15 +40,21 @@ def _run(options: argparse.Namespace) -> None:
 
     # Refuses what is none, before what takes seconds to import.
     find_runs([path for path in options.folder if path.suffix != ".jsonl"])
+    compare = re.split(r",(?! )", options.compare) if options.compare else ()
+    asked = options.threshold, options.baseline or (), compare
+    if options.publish:
+        from proposer_rl.report.publish import publish
+
+        written, left_out = publish(options.folder, options.publish, *asked)
+        print(*map(printable, [*left_out, f"Runs: {written} in {options.publish}"]), sep="\n")
+        return
     from proposer_rl.report.build import write_report
 
     page = write_report(
         options.folder,
         options.output,
-        options.threshold,
-        options.baseline or (),
+        *asked,
         progress=not options.quiet,
-        compare=re.split(r",(?! )", options.compare) if options.compare else (),
         meanings={group: choices(group, [CONFIG_FOLDER]) for group in ("method", "ablation")},
     )
     print(printable(f"Report: {page}"))
@@ -56,7 +63,7 @@ def _run(options: argparse.Namespace) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="bin/report",
-        description="Write tables, figures and a page from the folders of runs.",
+        description="Write a page, figures and tables that compare runs, or publish the runs.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -66,8 +73,16 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         help="a run's folder, or one with runs in it at any depth; a log of a teacher, *.jsonl",
     )
-    parser.add_argument(
+    output = parser.add_mutually_exclusive_group()
+    output.add_argument(
         "-o", "--output", type=Path, default=Path("report"), help="where to write (default: report)"
+    )
+    output.add_argument(
+        "--publish",
+        type=Path,
+        metavar="STUDY",
+        help="write no report, but the finished runs as a study to this folder: their tables, and "
+        "a README.md with figures; of a study that is there, runs of the same names are replaced",
     )
     parser.add_argument(
         "--threshold",

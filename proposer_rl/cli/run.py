@@ -1,4 +1,4 @@
-"""One experiment from its checked settings, and what is written beside it."""
+"""Carries out one run from its validated settings, and writes what describes it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from proposer_rl.runs.process import Interrupted, Status, StopSignals, locked, p
 from proposer_rl.runs.records import TaskFacts, checked, small_json
 
 SUMMARY = "summary.json"
-# What may differ: where it is computed and shown, and a longer schedule.
+# A resumed run may differ in these: where it is computed and shown, and how long it is.
 FREE = {"compute", "logger"}
 FREE_SCHEDULE = {"updates", "checkpoint_every", "checkpoint_seconds", "keep_checkpoints"}
 
@@ -38,34 +38,34 @@ FALLING = "solver.ppo.anneal_updates"
 
 
 Show = Callable[[Path, str, Mapping[str, Any]], None]
-"""Shows a run that is over, given its folder, name and summary; training itself draws nothing."""
+"""Shows a finished run, given its folder, name and summary."""
 
 
 def train(config: RunConfig, asked: Invocation, signals: StopSignals, show: Show) -> float:
-    """Carries out a run for the command line; where it is stopped, says how it goes on, and exits.
+    """Carries out a run for the command line; if it is stopped, prints how to resume it, and exits.
 
     Returns:
-        The headline measurement at the end, e.g. for a Hydra sweeper.
+        The headline measurement at the end, for Hydra's sweepers.
     """
     try:
         return carry_out(config, asked, signals, show)
     except Interrupted as stop:
         name = Signals(stop.signum).name
         say(f"Stopped by {name}; all is saved. To go on: {to_go_on(asked)}")
-        if "SUBMITIT_EXECUTOR" in os.environ:  # the sweep that sent this job waits for its result
+        if "SUBMITIT_EXECUTOR" in os.environ:  # the sweep that submitted this job awaits a result
             raise
         sys.exit(stop.exit_code)
     except KeyboardInterrupt:
-        stopped = "Stopped at once; what came after the last checkpoint is lost"
+        stopped = "Stopped at once; updates since the last checkpoint are lost"
         say(f"{stopped}. To go on: {to_go_on(asked)}")
         raise
 
 
 @torch.inference_mode(False)  # also where it is called without gradients
 def carry_out(config: RunConfig, asked: Invocation, signals: StopSignals, show: Show) -> float:
-    """Makes the parts of an experiment, and runs it in a folder that it locks meanwhile.
+    """Builds an experiment and runs it in its folder, which is locked meanwhile.
 
-    It is called inside the context of the signals that may ask the run to stop.
+    Call it inside the context of ``signals``.
 
     Returns:
         The headline measurement at the end.
@@ -75,15 +75,15 @@ def carry_out(config: RunConfig, asked: Invocation, signals: StopSignals, show: 
     """
     status = Status(config.proposer.meta_episode_length)
     config = as_begun(config, asked.folder)
-    made = parts(config, signals, status)  # whatever is wrong with the input is found here
+    made = parts(config, signals, status)  # refuses wrong input
     try:
-        checked(TaskFacts, made.task.facts, "task")  # as the run's readers will at its end
+        checked(TaskFacts, made.task.facts, "task")  # now, since reports would refuse them later
     except ValueError as error:
         raise ConfigError(one_line(error)) from error
     with locked(asked.folder):
         try:
             result = proceed(config, made, asked, signals, status, show)
-            signals.deliver()  # of a sweep the next run is not to begin
+            signals.deliver()  # so that the next run of a sweep does not begin
         except Interrupted as stop:
             stop.folder = asked.folder
             raise
@@ -104,10 +104,10 @@ def proceed(
     status: Status,
     show: Show,
 ) -> dict[str, Any]:
-    """Begins a run, resumes it, or says that it is finished; returns its summary."""
+    """Starts or resumes a run, or says that it is finished; returns its summary."""
     path = asked.folder
     folder = RunFolder(path)
-    # What `auto` has become, so that a run goes on in the same precision elsewhere.
+    # The precision that `auto` stands for here, so that the run keeps it on other machines.
     precision: Any = made.task.precision
     check_same_run(folder, replace(config, precision=precision))
     finished = _finished(path, config.schedule.updates)
@@ -130,9 +130,9 @@ def proceed(
 
 
 def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
-    """Returns the summary of a run that is already at the end of a schedule; else None.
+    """Returns the summary of a run that has reached the end of the schedule; else None.
 
-    One that goes on to a longer schedule has none until it ends again.
+    The summary of a run that goes on to a longer schedule is removed.
     """
     file, checkpoints = folder / SUMMARY, folder / "checkpoints"
     summary: dict[str, Any] | None = small_json(file)
@@ -149,21 +149,21 @@ def _finished(folder: Path, updates: int) -> dict[str, Any] | None:
 
 
 def check_same_run(folder: RunFolder, config: RunConfig) -> None:
-    """Refuses to go on with a run that was started with other settings.
+    """Refuses to resume a run that was started with other settings.
 
-    The stored configuration is compared with the present one and used for nothing else. If there is
-    none, the present one is written.
+    The stored configuration is only compared with the present one. If there is none, the present
+    one is stored.
     """
     now = {key: value for key, value in asdict(config).items() if key not in FREE}
     now["schedule"] = {k: v for k, v in now["schedule"].items() if k not in FREE_SCHEDULE}
     file, wrong = folder.path / "config.json", f"hydra.run.dir={folder.path}:"
     if not file.exists():
-        # Tables here are no run's of ours, and a run begins by removing what is left of one.
+        # Tables here belong to something else, and a new run would remove them.
         foreign = sorted([*folder.lengths(), *(p.name for p in folder.path.glob("checkpoints"))])
         if foreign:
             raise ConfigError(
-                f"{wrong} holds {foreign[0]} but no config.json, so it is no run's folder; give "
-                "another"
+                f"{wrong} holds {foreign[0]} but no config.json, so it is not a run's folder; use "
+                "another one"
             )
         folder.write_json(file.name, now)
         return
@@ -171,7 +171,7 @@ def check_same_run(folder: RunFolder, config: RunConfig) -> None:
     differing = _different(before, now)
     if differing:
         key, (old, new) = next(iter(differing.items()))
-        falls = "; by default it is schedule.updates: a longer run needs a new folder"
+        falls = "; its default is schedule.updates, so a longer run needs a new folder"
         raise ConfigError(
             f"{key}={new!r:.80}: the run in {folder.path} was started with {old!r:.80}; "
             f"differing keys: {', '.join(differing)}{falls * ([*differing] == [FALLING])}"
@@ -179,7 +179,7 @@ def check_same_run(folder: RunFolder, config: RunConfig) -> None:
 
 
 def as_begun(config: RunConfig, path: Path) -> RunConfig:
-    """Returns the settings with the precision that ``auto`` meant where the run was begun."""
+    """Returns the settings with the precision that ``auto`` stood for where the run was started."""
     file = path / "config.json"
     if config.precision != "auto" or not file.is_file():
         return config
@@ -190,7 +190,7 @@ def as_begun(config: RunConfig, path: Path) -> RunConfig:
 
 
 def _different(before: Any, now: Any, prefix: str = "") -> dict[str, tuple[Any, Any]]:
-    """Returns both values of every key that differs, by its dotted name."""
+    """Returns the two values of every key that differs, by its dotted name."""
     if not (isinstance(before, dict) and isinstance(now, dict)):
         return {} if before == now else {prefix.rstrip("."): (before, now)}
     return {
@@ -201,13 +201,13 @@ def _different(before: Any, now: Any, prefix: str = "") -> dict[str, tuple[Any, 
 
 
 def run_name(config: RunConfig) -> str:
-    """Returns the run's name, for pictures and loggers."""
+    """Returns a run's name for pictures and loggers."""
     ablation = "" if config.ablation == "none" else f"_{config.ablation}"
     return f"{config.method}{ablation}_seed_{'-'.join(map(str, config.seeds))}"
 
 
 def identity(experiment: Experiment, config: RunConfig, asked: Invocation) -> dict[str, Any]:
-    """Returns what the run is, and what it is made with: method, seeds, machine, versions."""
+    """Returns what identifies a run: method, seeds, command, machine and versions."""
     device = experiment.task.device
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else ""
     packages = ("proposer_rl", "torchrl", "tensordict", "hydra-core")
@@ -230,7 +230,7 @@ def identity(experiment: Experiment, config: RunConfig, asked: Invocation) -> di
         "workers": config.compute.workers,
         "versions": {
             "python": platform.python_version(),
-            "torch": str(torch.__version__),  # with its build, which not all of its wheels tell
+            "torch": str(torch.__version__),  # with its build, which some wheels' metadata lack
             **{package: version(package) for package in packages},
         },
     }
@@ -241,13 +241,13 @@ def to_go_on(asked: Invocation) -> str:
     paths, config = asked.python_path, asked.config_dir
     before = [f"PYTHONPATH={shlex.quote(paths)}"] if paths else []
     options = ["--config-dir", config] if config else []
-    own = [word for word in asked.overrides if not word.startswith("+sweep=")]
+    own = [word for word in asked.overrides if not word.startswith("sweep=")]
     words = shlex.join([*options, *own, quoted("hydra.run.dir", str(asked.folder))])
     return " ".join([*before, "bin/train", words])
 
 
 def _about(config: RunConfig, own: str | None) -> dict[str, str]:
-    """Returns what method and ablation do, by the first lines of their files."""
+    """Returns the descriptions of the method and the ablation from their files."""
     folders = [CONFIG_FOLDER, *([Path(own)] if own else [])]
     chosen = {"method": config.method, "ablation": config.ablation}
     said = {group: choices(group, folders).get(name, "") for group, name in chosen.items()}

@@ -1,4 +1,4 @@
-"""Starts ``bin/train`` and ``proposer-train``; help comes before PyTorch is imported."""
+"""Starts ``bin/train`` and ``proposer-train``; help is printed without importing PyTorch."""
 
 from __future__ import annotations
 
@@ -21,5 +21,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.argv[0] = "train"  # the name in the shell, bin/train: Hydra installs completion for it
+    sys.argv[0] = "train"  # the command for which Hydra installs completion, of bin/train
     main()

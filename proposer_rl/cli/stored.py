@@ -1,4 +1,4 @@
-"""A run's folder as the instruments read it: its settings, its task, its checkpoints."""
+"""Reads a run's folder for evaluation and play: its settings, its task, its checkpoints."""
 
 from __future__ import annotations
 
@@ -13,19 +13,15 @@ from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import RunConfig, saved_config
 from proposer_rl.cli.errors import ConfigError
 from proposer_rl.learning import PPO
-from proposer_rl.runs.checkpoint import (
-    CheckpointError,
-    checkpoint_files,
-    load_checkpoint,
-    load_latest,
-)
+from proposer_rl.runs.checkpoint import checkpoint_files, load_checkpoint, load_latest
 from proposer_rl.runs.folder import write_atomically
+from proposer_rl.settings import within
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
 
 class Stage(NamedTuple):
-    """A run's Solvers after some updates."""
+    """A run's Solvers at a checkpoint."""
 
     step: int
     updates: int
@@ -38,7 +34,7 @@ class Stage(NamedTuple):
 
 
 class StoredRun(NamedTuple):
-    """A run's folder."""
+    """A run that has checkpoints."""
 
     folder: Path
     config: RunConfig
@@ -46,9 +42,11 @@ class StoredRun(NamedTuple):
     files: list[Path]  # its checkpoints, oldest first; at least one
 
     def stage(self, file: Path | None = None, seeds: Sequence[int] | None = None) -> Stage:
-        """Returns the Solvers in one of the files; None stands for the newest intact one.
+        """Returns the Solvers of some seeds in one of the files.
 
-        Of several seeds those that are given, None for all.
+        Args:
+            file: None for the newest checkpoint that is intact.
+            seeds: None for all.
         """
         seeds = self.config.seeds if seeds is None else seeds
         if strangers := set(seeds) - set(self.config.seeds):
@@ -57,21 +55,17 @@ class StoredRun(NamedTuple):
         assert found is not None, "there is a checkpoint"
         step, state = found
         learner = self.task.learner([Streams(seed) for seed in seeds])
-        try:
-            every = TensorDict(state["solver"], [len(self.config.seeds)])
+        every = TensorDict(state["solver"], [len(self.config.seeds)])
+        with within("checkpoint", ValueError):  # of another network
             learner.restore(every[[self.config.seeds.index(seed) for seed in seeds]])
-            return Stage(step, int(state["updates"]), learner)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise CheckpointError(
-                "the checkpoint holds no Solver with the network of its run's config.json"
-            ) from error
+        return Stage(step, int(state["updates"]), learner)
 
 
 def stored_run(path: Path) -> StoredRun:
-    """Returns a run that has checkpoints.
+    """Reads the settings of a run and makes its task.
 
     Args:
-        path: the folder, or one of its checkpoints, which is the only file then.
+        path: the folder, or one of its checkpoints, which is then the only file.
     """
     folder, files = path.resolve(), [file for _, file in checkpoint_files(path / "checkpoints")]
     if path.is_file():

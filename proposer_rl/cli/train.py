@@ -1,7 +1,7 @@
-"""``bin/train``, but for its help: from the command line to the settings of one or more runs.
+"""Runs ``bin/train``: composes the settings of one run or of a sweep, and carries the runs out.
 
-What composes them needs no PyTorch, so that a typing error is told at once. A run that fails in a
-sweep leaves its reason in its folder.
+Composing needs no PyTorch, so that a typing error is reported at once. A run of a sweep that fails
+leaves the reason in its folder.
 """
 
 from __future__ import annotations
@@ -22,57 +22,57 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from proposer_rl.cli.errors import UNFORESEEN, ConfigError, command, exit_code, one_line, refuse
-from proposer_rl.cli.groups import arranged, check_chosen, check_groups, invocation, quoted
+from proposer_rl.cli.groups import arranged, check_chosen, check_scale, invocation
 from proposer_rl.recipes import CONFIG_FOLDER, composed, explained, plain_values
 from proposer_rl.runs.folder import FAILURE, RunFolder
 from proposer_rl.runs.process import InUseError, StopSignals, guard_output
 
-# The folder of the command's run or sweep, and the failures that a sweep's had before.
+# The folder of the command's run or sweep; of a sweep, also the failures recorded there before.
 COMMAND: list[tuple[Path, dict[Path, int] | None]] = []
 
 
 class FailedRunError(RuntimeError):
-    """A run of a sweep has failed, which is recorded; sweepers count it as a failure."""
+    """A run of a sweep has failed; the reason is recorded, and sweepers count it as a failure."""
 
 
 class CommandFolder(Callback):
-    """Notes the folder of the command's run or sweep before Hydra makes it."""
+    """Records the folder of the command's run or sweep before Hydra creates it."""
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        """Notes a run's folder."""
-        COMMAND.append((_expanded(config, "hydra.run.dir"), None))
+        """Records a run's folder."""
+        COMMAND.append((Path(config.hydra.run.dir).absolute(), None))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Notes a sweep's folder, and which runs failed there before."""
-        folder = _expanded(config, "hydra.sweep.dir")
+        """Records a sweep's folder, and which runs failed there before."""
+        folder = Path(config.hydra.sweep.dir).absolute()
         COMMAND.append((folder, _failures(folder)))
 
 
 def main() -> None:
     """Runs the command; the exit codes are those of :mod:`proposer_rl.cli.errors`."""
-    # Hydra then lets its errors through, so that they can be told in one line.
+    # With this Hydra raises its errors, so that they can be printed in one line here.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     command(_compose_and_run)
 
 
 def _compose_and_run() -> None:
     COMMAND.clear()
-    if sys.version_info >= (3, 14):  # it refuses a help text of Hydra's (to 1.3.8), no string
+    if sys.version_info >= (3, 14):  # which refuses a help text of Hydra 1.3 that is no string
         ArgumentParser._check_help = lambda self, action: None
     try:
         _prepare_arguments()
         _main()
     except FailedRunError:
-        pass  # it has been told, and is in the sweep's overview
+        pass  # it has been printed, and is in the sweep's overview
     except (HydraException, OmegaConfBaseException, UnicodeDecodeError, YAMLError) as error:
         raise ConfigError(explained(error)) from error
     except (OSError, ValueError) as error:
-        # Of Hydra's own files; logging hides it in a ValueError.
+        # Hydra could not write its own files; logging wraps this in a ValueError.
         cause = error if isinstance(error, OSError) else error.__cause__
         if not isinstance(cause, OSError):
             raise
@@ -89,17 +89,17 @@ def _compose_and_run() -> None:
 
 @hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="train")
 def _main(hydra_config: DictConfig) -> float:
-    guard_output()  # launchers start processes that begin here
+    guard_output()  # again, since launchers start processes that begin here
     about = HydraConfig.get()
     path, in_sweep = Path(about.runtime.output_dir), about.mode == RunMode.MULTIRUN
     signals = StopSignals()
     try:
-        (path / FAILURE).unlink(missing_ok=True)  # a run that failed is tried again
+        (path / FAILURE).unlink(missing_ok=True)  # a run that failed before starts again
         asked = invocation(about, path)
-        check_groups(asked.overrides)
+        check_scale(asked.overrides)
         check_chosen(hydra_config, about)
-        with signals:  # already now: amid imports is no place to stop
-            from proposer_rl.cli.config import read_config  # only now: it takes seconds
+        with signals:  # from here on, since imports must not be interrupted
+            from proposer_rl.cli.config import read_config  # late, since it takes seconds
             from proposer_rl.cli.run import train
             from proposer_rl.cli.watch import show_run
 
@@ -112,17 +112,17 @@ def _main(hydra_config: DictConfig) -> float:
         message = _record_failure(path, error)
     finally:
         if in_sweep:
-            # Environments hang in circles and may hold gigabytes that Python does not see, as
-            # MuJoCo's models; those of the next run would come on top.
+            # Environments are in reference cycles and may hold gigabytes outside of Python's view,
+            # as MuJoCo's models do, to which the next run would add its own.
             gc.collect()
-    # Not within the handler: the error's frames would hold the run's memory to the sweep's end.
+    # Outside of the handler, since the error's frames would keep the run's memory alive.
     raise FailedRunError(message)
 
 
 def _prepare_arguments() -> None:
-    """Refuses options by what Hydra's parser reads, and puts overrides as Hydra takes them."""
+    """Refuses options that are not supported, and spells overrides as Hydra takes them."""
     read = get_args_parser().parse_args()
-    if read.experimental_rerun is not None:  # Hydra reads a pickle, that is, runs code
+    if read.experimental_rerun is not None:  # Hydra would read a pickle, which may run code
         raise ConfigError("--experimental-rerun: not supported; give the run's own arguments again")
     folder = read.config_path or read.config_name
     if read.config_dir and not folder and (CONFIG_FOLDER / Path(read.config_dir).name).is_dir():
@@ -142,8 +142,8 @@ def _prepare_arguments() -> None:
 
 
 def _show_settings(words: Sequence[str], read: Namespace) -> None:
-    """Prints the settings that words ask for, as Hydra does, and defaults that are in no file."""
-    from proposer_rl.methods import completed  # only now: it takes seconds
+    """Prints the composed settings as Hydra does, with the defaults that are in no file."""
+    from proposer_rl.methods import completed  # late, since it takes seconds
 
     config = OmegaConf.create(completed(plain_values(composed(words))))
     part: Any = OmegaConf.select(config, read.package or "")
@@ -151,26 +151,15 @@ def _show_settings(words: Sequence[str], read: Namespace) -> None:
     print(str(text).rstrip())
 
 
-def _expanded(config: DictConfig, key: str) -> Path:
-    """Returns a folder of Hydra's configuration; ``~`` becomes the home folder there, too."""
-    given = str(OmegaConf.select(config, key))
-    path = Path(given).expanduser()
-    if given.startswith("~"):
-        with read_write(config.hydra), open_dict(config.hydra):
-            OmegaConf.update(config, key, str(path))
-            config.hydra.overrides.hydra.append(quoted(key, str(path)))  # for a sweep's jobs
-    return path.absolute()
-
-
 def _failures(folder: Path) -> dict[Path, int]:
-    """Returns the files that record failed runs in a sweep's folder, with their times."""
+    """Returns the files in a sweep's folder that record failed runs, with their times."""
     return {file: file.stat().st_mtime_ns for file in folder.rglob(FAILURE)}
 
 
 def _record_failure(folder: Path, error: Exception) -> str:
-    """Records in a run's folder that it failed, and returns the line that says so.
+    """Records in a run's folder that it failed, and returns the error's line.
 
-    Nothing is recorded of a run that another process is working on: the folder is not ours.
+    Nothing is written if another process is working in the folder.
     """
     message, code = one_line(error, folder), exit_code(error)
     if not isinstance(error, InUseError):

@@ -29,7 +29,7 @@ class SomeBins:
         ArgumentError: for an axis or a value that the space does not have.
 
     Example:
-        >>> from proposer_rl.tasks.mazes.distributions import SpecificationSpace
+        >>> from proposer_rl.tasks.mazes.generation import SpecificationSpace
         >>> space = SpecificationSpace((0.0, 0.2), (2, 4, 6), height=6, width=6)
         >>> empty = SomeBins(space, {"obstacle fraction": [0.0]})
         >>> empty.bins

@@ -32,6 +32,9 @@ class Combinator(LearnedCurriculum):
         self.required_results = tuple(
             dict.fromkeys(entry for part in parts for entry in part.required_results)
         )
+        self.optional_results = tuple(
+            dict.fromkeys(entry for part in parts for entry in part.optional_results)
+        )
         self.trains_replicas = any(part.trains_replicas for part in self._learned())
 
     def improve(self, student: Student, rng: Streams) -> dict[str, Any]:

@@ -123,6 +123,7 @@ class Curriculum:
             :class:`~proposer_rl.curricula.Student`.
         required_results: entries of an outcome that it needs besides the return: ``success``,
             ``rollout``.
+        optional_results: entries of an outcome from which it learns more, where they are told.
         state: names of the attributes that a resumed run needs. They may be numbers, texts,
             tensors, lists and dicts of these, and objects with a ``state_dict``. Override
             :meth:`state_dict` to save anything else.
@@ -130,6 +131,7 @@ class Curriculum:
 
     needs: tuple[str, ...] = ()
     required_results: tuple[str, ...] = ()
+    optional_results: tuple[str, ...] = ()
     state: ClassVar[tuple[str, ...]] = ()
 
     @classmethod

@@ -22,6 +22,8 @@ from proposer_rl.curricula import (
     outcome_of,
     require,
 )
+from proposer_rl.curricula.batches import saved
+from proposer_rl.curricula.bins import along_axes
 from proposer_rl.curricula.contract import proposed
 from proposer_rl.experiment.continued import ContinuedLevels, Credit
 from proposer_rl.experiment.tables import Log, RunTables
@@ -31,7 +33,8 @@ from proposer_rl.runs.folder import SLACK, RunFolder, can_reach, read_csv
 from proposer_rl.runs.process import Output, Status, StopRequested, StopSignals
 from proposer_rl.settings import ArgumentError, settings
 from proposer_rl.streams import Streams
-from proposer_rl.task import NoSuccessError, Task
+from proposer_rl.task import NoSuccessError, Task, nearest_bins
+from proposer_rl.task.protocols import MANY_BINS
 
 
 class Experiment:
@@ -198,13 +201,20 @@ class Experiment:
                 self._restore(before)
 
     def _log_cycle(self, improved: Sequence[Mapping[str, Any]] | None = None) -> bool:
-        """Writes the logs of the last cycle with the metrics of the new improvement."""
+        """Writes the logs of the cycle that has ended, and metrics of its improvement.
+
+        Each has the histogram of the levels trained on, unless the curriculum logs its own.
+
+        Returns:
+            Whether a curriculum logged something or was improved.
+        """
         logs = [curriculum.log() for curriculum in self.sides.curricula]
         metrics = [
             {**log, **own} for log, own in zip(logs, improved or [{}] * len(logs), strict=True)
         ]
-        if any(metrics):
-            self._tables.add_cycle(self.updates, self.cycles, metrics, self.costs)
+        rows = self.sides.with_histograms(metrics)
+        if any(rows):
+            self._tables.add_cycle(self.updates, self.cycles, rows, self.costs)
         return any(metrics)
 
     def _update(self) -> None:
@@ -320,6 +330,12 @@ class SideBySide:
     def __init__(self, task: Task, learner: PPO, curricula: Sequence[Curriculum]) -> None:
         self.curricula = list(curricula)
         self.students = [TaskStudent(task, learner, k) for k in range(len(curricula))]
+        self._space = task.space
+        known = hasattr(task.space, "locate") and bool(task.space.axes)
+        none_yet = torch.zeros(task.space.size, dtype=torch.int64)
+        counted = known and task.space.size <= MANY_BINS
+        # Levels of each bin, int64 [N]; None where the curriculum itself tells of them.
+        self._counts = [none_yet.clone() if counted else None for _ in curricula]
         for student, curriculum in zip(self.students, self.curricula, strict=True):
             require(student, curriculum.needs, type(curriculum).__name__)
             if "success" in curriculum.required_results and "success" not in task.results:
@@ -335,9 +351,30 @@ class SideBySide:
 
     def observe(self, credits: Sequence[Sequence[Credit]]) -> None:
         """Lets each curriculum observe its batches, or parts of them."""
-        for curriculum, student, own in zip(self.curricula, self.students, credits, strict=True):
+        each = zip(self.curricula, self.students, credits, self._counts, strict=True)
+        for curriculum, student, own, counts in each:
             for batch, outcome in own:
                 curriculum.observe(student, batch, outcome)
+                if counts is not None:
+                    bins = nearest_bins(self._space, self._space.locate(batch.levels))
+                    counts += bins.bincount(minlength=len(counts))
+
+    def with_histograms(self, logs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Adds to each curriculum's log how many levels it has observed near each bin since then.
+
+        That is ``histogram`` along the axes of the task's space, unless the curriculum logs its
+        own, or there are no bins to tell levels by, or too many of them.
+        """
+        rows = []
+        for k, log in enumerate(logs):
+            if "histogram" in log:
+                self._counts[k] = None
+            counts = self._counts[k]
+            if counts is not None and counts.any():
+                log = {"histogram": along_axes(counts, self._space), **log}
+                self._counts[k] = torch.zeros_like(counts)
+            rows.append(log)
+        return rows
 
     def improve(self, rngs: Sequence[Streams]) -> list[dict[str, Any]]:
         """Improves the curricula that learn, and returns the metrics of each."""
@@ -347,14 +384,16 @@ class SideBySide:
         ]
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the states of the curricula, and the counters of their students."""
+        """Returns the states of the curricula, the counters of their students, and histograms."""
         return {
+            "counts": saved(self._counts),
             "curricula": [curriculum.state_dict() for curriculum in self.curricula],
             "asked": [[student.frames, student.evaluations] for student in self.students],
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned."""
+        self._counts = saved(state["counts"])
         for curriculum, own in zip(self.curricula, state["curricula"], strict=True):
             curriculum.load_state_dict(own)
         for student, (frames, evaluations) in zip(self.students, state["asked"], strict=True):

@@ -1,4 +1,4 @@
-"""The page's charts and its slider as JSON: the numbers of the figures, with every single run."""
+"""Prepares the numbers of the page's charts and its slider as JSON."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MOST_BYTES = 2**20  # of all pictures of a study
 
 
 def charts(study: Study) -> dict[str, Json]:
-    """Returns everything that the page draws of a study, ready for JSON.
+    """Returns the numbers of all charts of a study, ready for JSON.
 
     Returns:
         ``methods``: each with its seeds. ``axes``: what can be on the abscissa.
@@ -127,7 +127,7 @@ def _mean(study: Study, group: Group, outcome: Outcome) -> Sequence[float]:
 
 
 def _stages(study: Study) -> dict[str, Json] | None:
-    """Returns what the page's slider shows: one run of each method, the first with recorded levels.
+    """Returns the stages of the slider for one run of each method, the first with recorded levels.
 
     If none of a method's runs has any, it is the first that recorded proposals.
 
@@ -135,7 +135,7 @@ def _stages(study: Study) -> dict[str, Json] | None:
         ``axes``: names and values of the space of levels, at most two. ``pictures``: each once, a
         PNG in base64. ``methods``: for every method null or the ``seed``, the ``curve`` of its
         headline and the ``stages``: updates, ``levels`` (the number of a picture, or lines of
-        text) and ``map``, the last record of what was proposed (rows of shares) or null.
+        text) and ``map`` (rows of shares of proposals, as recorded last or else first) or null.
         ``first``: the number of the method to begin with. None where no run recorded either, or
         the pictures are too large for a page.
     """
@@ -214,10 +214,8 @@ def _small(stored: str | None) -> str | None:
 
 
 def _map(run: Run, like: Run, updates: int) -> Json:
-    """Returns the shares of proposals that were last recorded up to that update; None without."""
-    shares = [
-        found
-        for cycle in run.cycles
-        if number(cycle["updates"]) <= updates and (found := like.shares(cycle)) is not None
-    ]
-    return [plain(row) for row in share_map(shares[-1])] if shares else None
+    """Returns the shares of proposals recorded last up to that update, or else first; or None."""
+    every = [(number(cycle["updates"]), like.shares(cycle)) for cycle in run.cycles]
+    known = [(at, shares) for at, shares in every if shares is not None]
+    shown = [shares for at, shares in known if at <= updates] or [s for _, s in known[:1]]
+    return [plain(row) for row in share_map(shown[-1])] if shown else None

@@ -136,8 +136,7 @@
     if (!maps.length) return;
     const even = 1 / maps[0].flat().length, largest = Math.max(2 * even, ...maps.flat(2));
     const ticks = (side) => ({ tickvals: side ? side.values.map((_, i) => i) : [], ticktext: side ? side.values.map(String) : [] });
-    const grid = stage.map ?? maps[0].map((row) => row.map(() => null));
-    draw(parts.map, [{ type: "heatmap", z: grid, zmin: 0, zmax: largest, xgap: 2, ygap: 2,
+    draw(parts.map, [{ type: "heatmap", z: stage.map, zmin: 0, zmax: largest, xgap: 2, ygap: 2,
       colorscale: [[0, "#542788"], [even / largest, "#f7f7f7"], [1, "#b35806"]], colorbar: { tickformat: ".0%", thickness: 12 },
       hovertemplate: "%{z:.2%} of the proposals<extra></extra>" }],
     { height: 300, xaxis: axis(columns.name, ticks(columns)), yaxis: axis(rows ? rows.name : "", ticks(rows)) });

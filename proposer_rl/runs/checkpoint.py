@@ -1,12 +1,11 @@
 """Checkpoints that survive a crash at any moment, and that cannot run code when they are read.
 
 A checkpoint is one file, ``step_000000123.pt``: a line with the SHA-256 of all that follows, a line
-of JSON with the format's number and the step, then what ``torch.save`` writes. It appears under its
-name only when it is complete and on the disk.
+of JSON with the format's number and the step, and the output of ``torch.save``. It appears under
+its name only when it is complete and on the disk.
 
-``torchrl.checkpoint`` (0.14) writes atomically and rotates too, but it neither waits for the disk
-nor keeps a checksum, so that a damaged newest checkpoint is found late or never, and it does not
-fall back to the one before.
+``torchrl.checkpoint`` (0.14) writes atomically and rotates, too, but it neither waits for the disk
+nor keeps a checksum, and does not fall back to an older checkpoint if the newest is damaged.
 """
 
 from __future__ import annotations
@@ -34,33 +33,32 @@ State = dict[str, Any]
 
 
 class CheckpointError(ValueError):
-    """A checkpoint is not what it should be; the message is one line that names the file."""
+    """A checkpoint cannot be used; the message is one line that names the file."""
 
     exit_code = 2
 
 
 class _DamagedError(CheckpointError):
-    """The file is not what was written; an older one may be intact."""
+    """The file is damaged; an older one may be intact."""
 
 
 def save_checkpoint(folder: str | os.PathLike[str], step: int, state: State, keep: int = 2) -> Path:
-    """Writes a checkpoint and removes those that are no longer needed.
+    """Writes a checkpoint and removes older ones.
 
     Args:
-        folder: where checkpoints lie; created if it does not exist.
-        step: the run's step. A checkpoint of the same step is replaced; later ones, which the run
-            did not go on from since they are damaged, are removed.
-        state: nested dicts, lists and tuples of tensors, numbers, text and None. Tensors are
-            written detached and from the CPU, so that a run can go on on another device.
-        keep: how many of the newest checkpoints stay.
+        folder: for checkpoints; created if it does not exist.
+        step: the run's step. A checkpoint of the same step is replaced. Later ones are removed:
+            they are damaged, since the run did not resume from them.
+        state: nested dicts, lists and tuples of tensors, numbers, texts and None. Tensors are
+            detached and moved to the CPU, so that a run can be resumed on another device.
+        keep: how many of the newest checkpoints to keep.
 
     Returns:
         The checkpoint's file.
 
     Raises:
-        CheckpointError: if the state holds anything else.
-        StorageError: if the disk cannot take it. In either case the checkpoints that were there
-            stay as they were.
+        CheckpointError: if the state holds values of other types.
+        StorageError: if the file cannot be written. In either case existing checkpoints remain.
     """
     folder = Path(folder)
     path = folder / f"step_{step:09d}.pt"
@@ -80,7 +78,7 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: State, kee
 
 
 def checkpoint_bytes(step: int, state: State) -> bytes:
-    """Returns a checkpoint as a file's content; see :func:`save_checkpoint`."""
+    """Returns the content of a checkpoint's file; see :func:`save_checkpoint`."""
     payload = io.BytesIO()
     torch.save(_plain(state, "state"), payload)
     body = json.dumps({"format": FORMAT, "step": step}).encode() + b"\n" + payload.getvalue()
@@ -94,15 +92,15 @@ def checkpoint_files(folder: Path) -> list[tuple[int, Path]]:
 
 
 def load_latest(folder: str | os.PathLike[str]) -> tuple[int, State] | None:
-    """Reads the newest intact checkpoint; logs a warning for each damaged one that it passes over.
+    """Reads the newest intact checkpoint, and logs a warning for each damaged one that is newer.
 
     Returns:
-        Its step and its state, tensors on the CPU; None if there is no checkpoint.
+        Its step and its state, with tensors on the CPU; None if there is no checkpoint.
 
     Raises:
-        CheckpointError: if there are checkpoints and all are damaged, or if the newest intact one
-            was written by another version or holds more than plain data.
-        StorageError: if one cannot be read.
+        CheckpointError: if all checkpoints are damaged, or if the newest intact one was written by
+            another version or holds more than plain data.
+        StorageError: if a file cannot be read.
     """
     files = checkpoint_files(Path(folder))
     for _, path in reversed(files):
@@ -119,18 +117,18 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[int, State]:
     """Reads one checkpoint.
 
     Returns:
-        Its step and its state, tensors on the CPU.
+        Its step and its state, with tensors on the CPU.
 
     Raises:
         CheckpointError: if the file is damaged, was written by a version with another format, or
-            holds more than plain data (reading it would then run code).
+            holds more than plain data, so that reading it could run code.
         StorageError: if the file cannot be read.
     """
     path = Path(path)
     with storage(path, "read"):
         content = path.read_bytes()
     digest, _, body = content.partition(b"\n")
-    if digest != hashlib.sha256(body).hexdigest().encode():  # before anything is looked at
+    if digest != hashlib.sha256(body).hexdigest().encode():
         raise _DamagedError(
             f"the checkpoint {path} is damaged ({len(content)} bytes, wrong checksum)"
         )
@@ -140,9 +138,9 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[int, State]:
         version, step = int(header["format"]), int(header["step"])
         if version == FORMAT:
             return step, torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
-    except Exception as error:  # whose text ends in advice on how to run code that may be in it
+    except Exception as error:  # torch's own text advises to run the code that may be in the file
         raise CheckpointError(
-            f"{path} is not a checkpoint of proposer_rl: it must hold tensors and plain data alone"
+            f"{path} is not a checkpoint of proposer_rl: it must hold only tensors and plain data"
         ) from error
     raise CheckpointError(
         f"the checkpoint {path} has format {version}, this version of proposer_rl reads only "
@@ -151,9 +149,11 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[int, State]:
 
 
 def learnt_curriculum(path: Path) -> State:
-    """Reads the curriculum's part of a checkpoint, of a run's newest one, or of what it left.
+    """Reads the state of a trained curriculum.
 
-    Of several seeds it is the first one's.
+    Args:
+        path: a checkpoint, a ``proposer.pt``, or a run's folder, whose newest checkpoint is read.
+            Of several seeds the state of the first is returned.
 
     Raises:
         CheckpointError: if there is none, or it cannot be used.
@@ -170,9 +170,9 @@ def learnt_curriculum(path: Path) -> State:
 
 
 def _plain(value: object, where: str) -> object:
-    """Copies a state, and refuses what could be saved but not be loaded with ``weights_only``."""
+    """Copies a state, and refuses values that ``weights_only=True`` could not load."""
     if isinstance(value, torch.Tensor):
-        # A clone: of a view, torch.save would write all the memory that it looks into.
+        # A clone, since for a view torch.save would write the whole storage behind it.
         return value.detach().cpu().clone()
     if isinstance(value, dict):
         return {
@@ -184,6 +184,6 @@ def _plain(value: object, where: str) -> object:
     if type(value) in _PLAIN:
         return value
     raise CheckpointError(
-        f"{where} is a {type(value).__name__}; a checkpoint holds dicts, lists, tuples, tensors, "
-        "numbers, text and None"
+        f"{where} is a {type(value).__name__}; a checkpoint can hold dicts, lists, tuples, "
+        "tensors, numbers, texts and None"
     )

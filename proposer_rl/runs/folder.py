@@ -1,10 +1,9 @@
 """A run's folder: tables that grow row by row and that a resumed run cuts back to its checkpoint.
 
-Two kinds of table lie in the folder, with a suffix each. ``.csv`` is tidy: a header, then rows of
-numbers and text. ``.jsonl`` holds one JSON object per line, for rows with lists in them. In
-both, one row is one line, and every float is written so that it reads back bit for bit. A line
-without its newline is a row that a crash interrupted: readers skip it, and
-:meth:`RunFolder.cut_back` removes it.
+There are two kinds of tables. ``.csv`` has a header and rows of numbers; ``.jsonl`` has one JSON
+object per line, for rows that contain lists. In both a row is a line, and floats are written so
+that they read back bit for bit. A line without its newline is a row that a crash interrupted:
+readers skip it, and :meth:`RunFolder.cut_back` removes it.
 """
 
 from __future__ import annotations
@@ -22,22 +21,22 @@ from typing import Any, TypeVar
 Number = int | float
 T = TypeVar("T")
 
-# What a run writes row by row; all else in its folder, tables of its user's too, is left alone.
+# The tables of a run. Other files in its folder are left alone.
 TABLES = ("curriculum.jsonl", "cycles.jsonl", "levels.jsonl", "metrics.csv", "training.csv")
-FAILURE = "error.json"  # what a sweep leaves in the folder of a run that failed
-PROPOSER = "proposer.pt"  # what a run's curriculum has learnt, alone: a checkpoint without Solvers
-# By how much a mean may miss a threshold that it reached: 18 of 20 in float32 is 0.89999998.
+FAILURE = "error.json"  # the reason why a run of a sweep failed
+PROPOSER = "proposer.pt"  # the trained curriculum of a run: a checkpoint without Solvers
+# Tolerance for a mean that reaches a threshold: 18 of 20 in float32 is 0.89999998.
 SLACK = 1e-6
 
 
 class StorageError(OSError):
-    """The disk did not take or give a file; the message is one line that names it."""
+    """A file cannot be read or written; the message is one line that names it."""
 
     exit_code = 4
 
 
 class RunFolder:
-    """The folder of one run; created, with its parents, if it does not exist.
+    """The folder of one run, created with its parents if it does not exist.
 
     Raises:
         StorageError: if it cannot be created.
@@ -49,17 +48,17 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
 
     def append(self, name: str, row: Mapping[str, object]) -> None:
-        """Adds a row to a table and waits until it is on the disk: a crash loses at most this row.
+        """Appends a row to a table and waits until it is on the disk.
 
         Args:
             name: the table's file name, one of :data:`TABLES`.
-            row: for ``.csv`` numbers, with the same keys in every row of the table (the
-                first row makes the header); for ``.jsonl`` whatever JSON can hold.
+            row: for ``.csv`` numbers, with the same keys in every row of the table (the first row
+                makes the header); for ``.jsonl`` any values that JSON can hold.
 
         Raises:
             ValueError: if the keys are not those of the header.
-            TypeError: if a value is no number, or JSON cannot hold it.
-            StorageError: if the disk does not take the row.
+            TypeError: if a value is not a number, or JSON cannot hold it.
+            StorageError: if the row cannot be written.
         """
         path = self.path / name
         with storage(path):
@@ -74,13 +73,13 @@ class RunFolder:
         return {path.name: len(_row_ends(path)) for path in self._tables()}
 
     def cut_back(self, lengths: Mapping[str, int]) -> None:
-        """Removes the rows that were added after ``lengths()`` returned ``lengths``.
+        """Removes the rows that were appended after :meth:`lengths` returned ``lengths``.
 
-        Tables without rows then, or that are not named, are deleted. All is checked before anything
-        is changed, and a call that was interrupted can be repeated.
+        Tables that had no rows then are deleted. Nothing is changed unless all tables are long
+        enough, and a call that was interrupted can be repeated.
 
         Raises:
-            ValueError: if a table has fewer rows than it should keep.
+            ValueError: if a table has fewer rows than should be kept.
             StorageError: if a table cannot be changed.
         """
         sizes = {}
@@ -101,7 +100,7 @@ class RunFolder:
         _sync_folder(self.path)
 
     def write_json(self, name: str, value: object) -> None:
-        """Writes a JSON file; a reader sees the old content or the new, never a part."""
+        """Writes a JSON file atomically; a reader sees either the old content or the new."""
         write_atomically(self.path / name, (json.dumps(value, indent=2) + "\n").encode())
 
     def _tables(self) -> list[Path]:
@@ -109,12 +108,12 @@ class RunFolder:
 
 
 def is_rate(name: str) -> bool:
-    """Returns whether a column holds shares from 0 to 1, as success is."""
+    """Returns whether a column holds rates from 0 to 1, such as success."""
     return "success" in name.split("_")
 
 
 def can_reach(name: str, threshold: float) -> bool:
-    """Returns whether a column can reach a threshold: a rate is above 0 and at most 1."""
+    """Returns whether a threshold is possible for a column; a rate's is above 0 and at most 1."""
     return not is_rate(name) or 0 < threshold <= 1
 
 
@@ -122,7 +121,7 @@ def read_csv(path: str | os.PathLike[str]) -> list[dict[str, Number]]:
     """Returns the complete rows of a ``.csv`` table, as :meth:`RunFolder.append` was given them.
 
     Raises:
-        ValueError: naming the file and the line that is no such row.
+        ValueError: naming the file and the line that is not such a row.
         FileNotFoundError: if there is no such file.
     """
     header = (_first_line(Path(path)) or "").split(",")
@@ -134,27 +133,28 @@ def read_csv(path: str | os.PathLike[str]) -> list[dict[str, Number]]:
 
 
 def read_jsonl(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
-    """Returns the complete rows of a ``.jsonl`` table; a ValueError names any other line."""
+    """Returns the complete rows of a ``.jsonl`` table; raises as :func:`read_csv`."""
     return [*_parsed(Path(path), lambda line: dict(json.loads(line)))]
 
 
 def read_table(path: Path) -> Sequence[Mapping[str, Any]]:
-    """Returns the complete rows of either kind of table."""
+    """Returns the complete rows of a table of either kind."""
     return read_csv(path) if path.suffix == ".csv" else read_jsonl(path)
 
 
 def write_atomically(path: Path, content: bytes, durably: bool = True) -> None:
-    """Writes a file under a temporary name beside it, then renames it, and waits for the disk.
+    """Writes a file under a temporary name, renames it, and waits until it is on the disk.
 
-    A crash leaves the old file as it was, and perhaps a ``.NAME.tmp``; an error leaves only it.
+    After an error the old file is as it was; a crash may also leave a ``.NAME.tmp``.
 
     Args:
         path: the file.
         content: all of it.
-        durably: wait for the disk; where a file is worthless once the machine stops, do not.
+        durably: whether to wait for the disk, which is not needed for a file that is worthless
+            after a crash of the machine.
 
     Raises:
-        StorageError: if the disk cannot take it.
+        StorageError: if it cannot be written.
     """
     temporary = path.with_name(f".{path.name}.tmp")
     with storage(path):
@@ -162,7 +162,7 @@ def write_atomically(path: Path, content: bytes, durably: bool = True) -> None:
             _write(temporary, "wb", content, durably)
             os.replace(temporary, path)
         except BaseException:
-            # A full disk must not stay full of an attempt.
+            # On a full disk the temporary file would take the space that is left.
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
             raise
@@ -172,7 +172,7 @@ def write_atomically(path: Path, content: bytes, durably: bool = True) -> None:
 
 @contextmanager
 def storage(path: Path, action: str = "write") -> Iterator[None]:
-    """Turns any error of the operating system inside into one that names the file.
+    """Replaces errors of the operating system by one that names the file.
 
     Raises:
         StorageError: instead of any other OSError.
@@ -184,12 +184,12 @@ def storage(path: Path, action: str = "write") -> Iterator[None]:
 
 
 def _csv(path: Path, row: Mapping[str, object], header: str | None) -> str:
-    """Returns a row as text, in the header's order; with a header if there is none yet."""
+    """Returns a row as text in the header's order, after a header if there is none yet."""
     columns = list(row) if header is None else header.split(",")
     if set(row) != set(columns) or any(set(name) & set(',"\r\n') for name in columns):
         raise ValueError(
-            f"{path}: a row has {', '.join(row)}; its columns are {', '.join(columns)}, and have "
-            "no commas, quotes or line breaks in their names"
+            f"{path}: a row has {', '.join(row)}; the columns are {', '.join(columns)}, and their "
+            "names must have no commas, quotes or line breaks"
         )
     line = ",".join(map(_text, map(row.__getitem__, columns)))
     return line if header is not None else ",".join(columns) + "\n" + line
@@ -205,9 +205,9 @@ def _number(text: str) -> Number:
 
 
 def _parsed(path: Path, parse: Callable[[str], T], first: int = 0) -> Iterator[T]:
-    """Yields what is parsed of each complete line, from one on; a ValueError says where it fails.
+    """Parses each complete line from a first one on; a ValueError names the file and line.
 
-    Line ends of Windows, and the mark that editors there put in front, are no part of a line.
+    Line ends of Windows, and the byte-order mark that editors there write, are removed.
     """
     with open(path, "rb") as file:
         for number, line in enumerate(file):
@@ -219,19 +219,19 @@ def _parsed(path: Path, parse: Callable[[str], T], first: int = 0) -> Iterator[T
 
 
 def _first_line(path: Path) -> str | None:
-    """Returns the first line of a table; None without one."""
+    """Returns the first line of a table; None if there is none."""
     return next(_parsed(path, str), None) if path.exists() else None
 
 
 def _row_ends(path: Path) -> list[int]:
-    """Returns where in a table each complete row ends, in bytes."""
+    """Returns the byte offsets at which the complete rows of a table end."""
     with open(path, "rb") as file:
         ends = list(accumulate(len(line) for line in file if line.endswith(b"\n")))
     return ends[1:] if path.suffix == ".csv" else ends
 
 
 def _write(path: Path, mode: str, content: bytes, durably: bool = True) -> None:
-    """Writes to a file and, if asked, waits until it is on the disk."""
+    """Writes to a file, and waits until it is on the disk if asked to."""
     with open(path, mode) as file:
         file.write(content)
         file.flush()
@@ -240,10 +240,10 @@ def _write(path: Path, mode: str, content: bytes, durably: bool = True) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Waits until the names in a folder are on the disk: a rename is not before that.
+    """Waits until the names in a folder are on the disk, as after a rename.
 
-    Some file systems cannot do it, and Windows cannot open folders; what is in the files is on the
-    disk all the same.
+    Some file systems cannot do this, and Windows cannot open folders. The contents of the files are
+    on the disk all the same.
     """
     try:
         descriptor = os.open(folder, os.O_RDONLY)
@@ -256,6 +256,6 @@ def _sync_folder(folder: Path) -> None:
             raise
         warnings.warn(
             f"folders cannot be synced here ({error.strerror}): all files are written and synced, "
-            "but if the machine crashes, the newest may lack their names",
-            stacklevel=1,  # told once, whoever writes
+            "but if the machine crashes, the names of the newest may be lost",
+            stacklevel=1,  # so that it is shown only once
         )

@@ -1,4 +1,4 @@
-"""The process of a run: its output, signals that stop it, its folder's lock, what it is doing."""
+"""The process of a run: its output, stop signals, the lock of its folder, and its progress."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from filelock import FileLock, Timeout
 
 from proposer_rl.runs.folder import storage, write_atomically
 
-# Ctrl-C; the polite kill; a closed terminal; what Slurm and submitit send before a job is
-# pre-empted or runs out of time. Windows has the first two.
+# Ctrl-C; kill; a closed terminal; two that Slurm and submitit send before a job is pre-empted or
+# runs out of time. Windows has only the first two.
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1", "SIGUSR2")
 STOP_SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 PROGRESS = "progress.json"
@@ -31,28 +31,28 @@ EVERY = 1.0  # seconds between two writes
 class Output:
     """Wraps a text stream so that writing to it never raises.
 
-    A terminal may close, or the reader of a pipe end, while a run has hours to go: what it prints
-    is lost then, and nothing else. Characters that the stream's encoding lacks become ``?``.
+    If the terminal closes or the reader of a pipe ends, a run that has hours to go continues, and
+    only its output is lost. Characters that the stream's encoding lacks become ``?``.
 
     Args:
-        stream: what is written to; None, as Python has it for a closed descriptor, for nothing.
+        stream: the stream; None, which Python has for a closed descriptor, discards the output.
     """
 
     def __init__(self, stream: TextIO | None) -> None:
-        # The null device takes the closed descriptor's number, which a run's file must not get.
-        self._stream = stream or open(os.devnull, "w")  # noqa: SIM115  open as long as the process
+        # The null device takes the number of the closed descriptor, so that no file of a run does.
+        self._stream = stream or open(os.devnull, "w")  # noqa: SIM115  open until the process ends
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
     def __eq__(self, other: object) -> bool:
-        # So that tqdm knows its stream, and clears the bars on it before it writes a text there.
+        # So that tqdm recognizes its stream, and clears its bars before it writes a text.
         return other is self or other is self._stream or NotImplemented
 
     __hash__ = object.__hash__
 
     def write(self, text: str) -> int:
-        """Writes a text if somebody takes it."""
+        """Writes a text, or discards it if that is not possible."""
         encoding = getattr(self._stream, "encoding", None) or "utf-8"
         with suppress(OSError, ValueError):
             self._stream.write(text.encode(encoding, "replace").decode(encoding))
@@ -65,20 +65,20 @@ class Output:
 
 
 def guard_output() -> None:
-    """Makes the process's standard output and error streams that never raise."""
+    """Wraps standard output and standard error so that writing to them never raises."""
     for name in ("stdout", "stderr"):
         if not isinstance(stream := getattr(sys, name), Output):
             setattr(sys, name, Output(stream))
 
 
 class Interrupted(Exception):
-    """The run was asked to stop, and has saved what is needed to go on.
+    """The run was asked to stop, and has saved a checkpoint.
 
     Args:
         signum: the signal.
 
     Attributes:
-        folder: where the run lies; None where that is not known.
+        folder: of the run; None if it is not known.
     """
 
     folder: Path | None = None
@@ -91,24 +91,24 @@ class Interrupted(Exception):
         saved = f"stopped by {signal.Signals(self.signum).name}; all is saved"
         if self.folder is None:
             return saved
-        return f"{saved}. The same call with folder={str(self.folder)!r} goes on"
+        return f"{saved}. To resume, call again with folder={str(self.folder)!r}"
 
     @property
     def exit_code(self) -> int:
-        """The exit code of a process that the signal ends, as in shells."""
+        """The exit code that shells give to a process that the signal ends."""
         return 128 + self.signum
 
 
 class StopRequested(Exception):
-    """A signal has come during long work, which ends here and can be repeated."""
+    """A signal has come during long work, which is abandoned and can be repeated."""
 
 
 class StopSignals:
-    """A context in which a stop signal is kept until the run comes to a safe point.
+    """A context that keeps a stop signal until the run reaches a safe point.
 
-    A second SIGINT is not kept: it raises KeyboardInterrupt at once. A signal that is ignored (as
-    ``nohup`` has it) stays so. Outside of the main thread nothing is changed, since Python delivers
-    signals there only.
+    A second SIGINT raises KeyboardInterrupt at once. Signals that are ignored, as under ``nohup``,
+    stay ignored. Outside of the main thread the context changes nothing, since Python delivers
+    signals only to the main thread.
     """
 
     def __init__(self) -> None:
@@ -129,7 +129,7 @@ class StopSignals:
 
     @property
     def pending(self) -> bool:
-        """True if a signal has come."""
+        """Whether a signal has come."""
         return self._pending is not None
 
     def check(self) -> None:
@@ -142,14 +142,14 @@ class StopSignals:
             raise StopRequested
 
     def deliver(self) -> None:
-        """Acts on the signal that has come: to be called once all is saved.
+        """Acts on the signal that has come, if any; call it when a checkpoint has been saved.
 
-        A handler that was there before this context is called, such as submitit's, which puts the
-        job into the queue again and exits; if it returns, the run goes on.
+        If there was a handler before this context, it is called, such as submitit's, which puts the
+        job into the queue again and exits. If the handler returns, the run continues.
 
         Raises:
-            Interrupted: if there was no such handler, or it raises, as submitit's does where a job
-                has run out of time too often to be queued again.
+            Interrupted: if there was no handler, or it raises, as submitit's does if a job has run
+                out of time too often to be queued again.
         """
         signum, self._pending = self._pending, None
         if signum is None:
@@ -168,17 +168,17 @@ class StopSignals:
         self._pending = signum
         hint = "; once more: stop at once" if signum == signal.SIGINT else ""
         line = f"\n{signal.Signals(signum).name}: saving at the next safe point{hint}\n"
-        with suppress(OSError):  # a closed terminal must not keep the run from being saved
-            os.write(2, line.encode())  # print is not safe to enter twice
+        with suppress(OSError):  # the terminal may be closed
+            os.write(2, line.encode())  # print is not reentrant
 
 
 def _shield_tracker() -> None:
-    """Starts Python's resource tracker, if it does not run, with stop signals blocked.
+    """Starts Python's resource tracker with stop signals blocked, unless it is running.
 
-    Slurm signals every process of a step. The tracker, which tqdm's lock brings, would die of most,
-    and its successor complain in tracebacks of what it does not know.
+    Slurm signals all processes of a step, and most signals would end the tracker, which tqdm's lock
+    starts; its successor would print tracebacks about resources that it does not know.
     """
-    if not hasattr(signal, "pthread_sigmask"):  # Windows, which has no such tracker
+    if not hasattr(signal, "pthread_sigmask"):  # on Windows, which has no tracker
         return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     try:
@@ -188,23 +188,22 @@ def _shield_tracker() -> None:
 
 
 class InUseError(RuntimeError):
-    """Another process works in the folder; the message is one line that names it."""
+    """Another process is working in the folder; the message is one line that names it."""
 
     exit_code = 5
 
 
 @contextmanager
 def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
-    """Keeps other processes out of a folder.
+    """Locks a folder against other processes.
 
-    The operating system gives the lock up when the process ends, in whatever way: a lock of a dead
-    process blocks nobody.
+    The operating system releases the lock when the process ends, even if it is killed.
 
     Args:
-        folder: where ``.lock`` is made, and ``.holder.json``, which tells others who holds it.
+        folder: gets a ``.lock``, and a ``.holder.json`` that says who holds it.
 
     Raises:
-        InUseError: at once, if another process holds it, naming host, process and start.
+        InUseError: at once, if another process holds the lock, naming host, process and start.
         StorageError: if the folder cannot be written to.
     """
     path = Path(folder)
@@ -228,15 +227,15 @@ def _holder(folder: Path) -> str:
         holder = json.loads((folder / ".holder.json").read_text())
         return f"process {holder['process']} on {holder['host']}, started {holder['started']}"
     except (OSError, ValueError, TypeError, KeyError):
-        return "another process"  # which has just begun
+        return "another process"  # which has not written the file yet
 
 
 class Status:
-    """Says what a run is doing.
+    """Reports what a run is doing.
 
     Args:
-        parts: number of parts of the work that is told in parts.
-        clock: seconds.
+        parts: number of parts in work that is reported in parts.
+        clock: returns seconds.
     """
 
     def __init__(self, parts: int = 1, clock: Callable[[], float] = time.monotonic) -> None:
@@ -249,19 +248,18 @@ class Status:
 
     @contextmanager
     def of_run(self, folder: Path, show: Callable[[], None]) -> Iterator[None]:
-        """Reports a run's activity in its folder while inside, and calls ``show`` as often."""
+        """A context in which reports are written to a run's folder, and ``show`` is called."""
         self._folder, self._show = folder, show
         try:
             yield
         finally:
             self._folder = None
-            # A run that is over does nothing, however it ended; and why it did is to be told, not
-            # that a file of no worth stays.
+            # An error here must not hide the error that ended the run.
             with suppress(OSError):
                 (folder / PROGRESS).unlink()
 
     def tell(self, doing: str, part: int = 0) -> None:
-        """Reports what the run does, and how many parts of it are done; 0 where it has none."""
+        """Reports what the run is doing, and how many parts of it are done, if it has parts."""
         self.doing = f"{doing} {min(part, self._parts)}/{self._parts}" if part else doing
         now = self._clock()
         if self._folder is None or now - self._told < EVERY:
@@ -273,7 +271,7 @@ class Status:
 
 
 def processor() -> str:
-    """Returns the processor's name, or else its kind."""
+    """Returns the processor's name, or its architecture if that is not known."""
     information = Path("/proc/cpuinfo")
     if information.exists():
         for line in information.read_text(encoding="utf-8").splitlines():

@@ -1,4 +1,4 @@
-"""The records of a run: their types, and their numbers, texts and pictures for a reader."""
+"""Reads a run's records: validates them, and returns their numbers, texts and pictures."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from pydantic import BaseModel, FiniteFloat, TypeAdapter, ValidationError
 from proposer_rl.runs.folder import is_rate
 
 ACRONYMS = ("id", "ood")  # in- and out-of-distribution
-LARGEST = 1e100  # what is greater is no measurement, and overflows when it is drawn
-LONGEST_TEXT = 400  # characters of what is shown in a line
+LARGEST = 1e100  # greater numbers are not measurements, and overflow when they are drawn
+LONGEST_TEXT = 400  # characters that are shown in a line
 
-# Total gains of replicas, by their name in the records of cycles; the first that is there is shown.
+# Total gains of replicas, by their names in the records of cycles; the first one found is shown.
 GAINS = {"log_success_gain": "log success", "return_gain": "return"}
-# What of a cycle's record is not a number of the curriculum's own.
+# Entries of a cycle's record that are not the curriculum's own.
 PLACE = {"cycle", "updates", "seed", "curriculum_frames", "evaluations", "histogram"}
 
 Column = NDArray[np.float64]
 Record = Mapping[str, Any]
 T = TypeVar("T")
-_adapter = cache(TypeAdapter)  # making one takes longer than checking a value
-COLOURS = 64  # of a picture: enough for drawings, and a third of the bytes
-WIDTH = 150  # pixels, of lines of text
+_adapter = cache(TypeAdapter)  # slower to make than to use
+COLOURS = 64  # of a picture: enough for drawings, in a third of the bytes
+WIDTH = 150  # of a picture of text, in pixels
 
 
 class LevelRecord(BaseModel):
-    """A level as its task recorded it: a PNG in base64, and lines of text."""
+    """A level as its task recorded it: a PNG in base64, lines of text, or both."""
 
     picture: str | None = None
     text: list[str] = []
@@ -52,20 +52,20 @@ class SampleRecord(BaseModel):
 
 
 class TaskFacts(BaseModel):
-    """A run's description of its task, for its readers.
+    """A run's description of its task, for reports.
 
     Attributes:
-        title: what it is, as ``6×6 mazes``.
-        levels: what a level is called, plural.
-        distributions: names of what was measured on.
-        space: of the levels that are chosen from: the values along each axis, numbers or texts,
-            by its name.
-        about: further facts, by their label.
-        measured: all that must be equal for two runs to be comparable.
+        title: such as ``6×6 mazes``.
+        levels: the word for levels, plural.
+        distributions: names of the distributions that were measured on.
+        space: that the curriculum chooses from: the values along each axis, numbers or texts, by
+            name.
+        about: further facts, by label.
+        measured: everything that must be equal for two runs to be comparable.
         samples: levels of each distribution.
-        key: what is to be seen in pictures.
-        text_key: what is to be seen in levels drawn in characters.
-        exact: whether nothing is drawn at random to measure it; None where that is not said.
+        key: explains pictures of levels.
+        text_key: explains levels that are drawn in characters.
+        exact: whether measurements draw nothing at random; None if that is not known.
     """
 
     title: str
@@ -81,10 +81,10 @@ class TaskFacts(BaseModel):
 
 
 def checked(kind: type[T], value: Any, where: str) -> T:
-    """Returns a value from a file or a request, validated; bytes are read as JSON.
+    """Validates a value from a file or a request; bytes are read as JSON.
 
     Raises:
-        ValueError: with the place of the first thing that is not so.
+        ValueError: naming the place of the first error.
     """
     adapter = _adapter(cast(Hashable, kind))
     check = adapter.validate_json if isinstance(value, bytes) else adapter.validate_python
@@ -131,7 +131,7 @@ def anywhere(text: str) -> str:
 
 
 def number(value: Any) -> float:
-    """Returns a recorded number, of a list of numbers the mean; NaN where it is neither."""
+    """Returns a recorded number, or the mean of a list of numbers; NaN for other values."""
     if isinstance(value, list):
         found = numbers(value)
         return math.nan if found is None else float(found.mean())
@@ -141,7 +141,7 @@ def number(value: Any) -> float:
 
 
 def numbers(value: Any) -> Column | None:
-    """Returns a list of finite numbers as an array [n]; None where it is none."""
+    """Returns a list of finite numbers as an array [n]; None for other values."""
     if not isinstance(value, list) or not value or any(isinstance(one, list) for one in value):
         return None
     found = np.array([number(one) for one in value])
@@ -149,9 +149,9 @@ def numbers(value: Any) -> Column | None:
 
 
 def batch_shares(record: Record) -> dict[str, float]:
-    """Returns a record's ``shares`` of a batch by the names of its parts.
+    """Returns a record's ``shares`` of a batch by the names of its parts; empty if it has none.
 
-    A share is the mean over several students; the result is empty where a record has none.
+    The shares of several students are averaged.
     """
     told = record.get("shares")
     means = {name: number(own) for name, own in told.items()} if isinstance(told, Mapping) else {}
@@ -159,14 +159,14 @@ def batch_shares(record: Record) -> dict[str, float]:
 
 
 def words(name: str) -> str:
-    """Returns a column's name in words: ``id_success`` is ID success, as of the mazes."""
+    """Returns a column's name in words, such as "ID success" for ``id_success``."""
     first, _, rest = name.partition("_")
     first = first.upper() if first in ACRONYMS else first
     return f"{first} {rest.replace('_', ' ')}".strip()
 
 
 def level_text(name: str, value: float) -> str:
-    """Returns a column's value as text: 80% of a success, 0.8 of anything else."""
+    """Returns a column's value as text: 80% for a success, 0.8 for other columns."""
     return f"{100 * value:g}%" if is_rate(name) else f"{value:g}"
 
 

@@ -1,4 +1,4 @@
-"""Tasks: what they are made of, and the base of all."""
+"""The base of tasks, and the interfaces of their parts."""
 
 from proposer_rl.task.base import Task as Task
 from proposer_rl.task.protocols import Board as Board
@@ -17,7 +17,7 @@ from proposer_rl.task.protocols import Space as Space
 from proposer_rl.task.protocols import check_distributions as check_distributions
 from proposer_rl.task.protocols import for_copies as for_copies
 from proposer_rl.task.protocols import level_inputs as level_inputs
-from proposer_rl.task.protocols import named as named
+from proposer_rl.task.protocols import nearest_bins as nearest_bins
 from proposer_rl.task.protocols import refuse_many_bins as refuse_many_bins
 from proposer_rl.task.protocols import refuse_unfit_bins as refuse_unfit_bins
 from proposer_rl.task.protocols import space_features as space_features

@@ -1,4 +1,4 @@
-"""The base of tasks; ``examples/own_task.py`` is a whole one.
+"""The base of tasks; see ``examples/own_task.py`` for a complete one.
 
 K are Solvers, P the levels of one update, T its steps, E validation levels, C probes, N bins.
 """
@@ -44,61 +44,62 @@ from proposer_rl.task.protocols import (
     space_features,
 )
 
-SAMPLES_SHOWN = 6  # levels of each distribution that a reader is shown
+SAMPLES_SHOWN = 6  # levels of each distribution for readers
 
 
 class Task(ABC):
-    """An environment in which Solvers are trained, and how they are measured.
+    """Trains Solvers in an environment and measures them; subclass it for your own task.
 
-    One word has one meaning. A **performance** is what Solvers reach on levels: return and success.
-    To **evaluate** is to find it on the fixed evaluation levels, one by one. **Metrics** are the
-    numbers that sum this up (:meth:`measure`), or the training (:meth:`training_metrics`).
-    **Records** are levels as pictures and text. **Facts** describe the task for readers.
+    A **performance** is the return and success of Solvers on levels. To **evaluate** is to compute
+    it on each fixed evaluation level. **Metrics** summarize this (:meth:`measure`) or the training
+    (:meth:`training_metrics`). **Records** show levels as pictures and text. **Facts** describe the
+    task for readers.
 
-    A task must give :meth:`environment`, :meth:`network`, a ``title``, and call this constructor;
-    all the rest can be replaced.
+    A subclass must define :meth:`environment`, :meth:`network` and a ``title``, and call this
+    constructor. It may override everything else.
 
     Args:
-        distributions: by name, for hand-designed curricula and to be measured on.
-        target: the name of the one that is to be mastered.
-        space: what a Proposer chooses among.
+        distributions: by name, for hand-designed curricula and for measuring.
+        target: name of the distribution to be mastered.
+        space: the levels among which a Proposer chooses.
         solver: the Solver's training.
-        context: precision and cores; whether there are graphs. Its device is what the task's levels
-            are made on: where they are, everything is computed.
-        measured_on: names of the distributions that Solvers are measured on; None for all.
+        context: precision, cores, and whether a GPU replays graphs. A task makes its levels on the
+            context's device; everything is computed where they are.
+        measured_on: names of the distributions to measure Solvers on; None for all.
         levels: fixed evaluation levels E of each of them, the same in every run.
-        seed: from which they are drawn, and the actions of the evaluations' episodes.
-        max_steps: of an episode in evaluations; None for the horizon of the training's rollouts.
+        seed: of these levels, and of the actions in evaluations.
+        max_steps: step limit of an episode in evaluations; None for the horizon of the training's
+            rollouts.
         episodes: played on each level to measure a performance.
-        greedy: whether their actions are the most probable ones; else they are drawn.
+        greedy: whether evaluations take the most probable actions, or sample them.
         measured: all further settings that must be equal for two runs' metrics to be comparable,
             for JSON.
 
     Attributes:
         title: of its runs.
-        noun: what levels are called, in the plural.
-        key: what is to be seen in a record's picture.
-        text_key: what is to be seen in a record's text; None where it explains itself.
-        results: entries of a performance, ``"return"`` and, where it has a meaning, ``"success"``.
+        noun: a word for levels, in the plural.
+        key: description of a record's picture.
+        text_key: description of a record's text; None if it needs none.
+        results: entries of a performance, ``"return"`` and, if it has a meaning, ``"success"``.
         exact_performance: whether :meth:`performance` draws nothing at random.
         exact_metrics: whether :meth:`measure` draws nothing at random.
-        default_levels: the name that :meth:`level_results` takes where none is given.
-        reward_scale: that rewards of training were multiplied with; returns are given without it.
-        batched: as of :class:`~proposer_rl.models.Population`.
-        episodes_at_once: of each Solver, that are played at once in evaluations; None for all.
-        observed: entries that the network is called with, in order.
+        default_levels: name of the levels for :meth:`level_results` if none is given.
+        reward_scale: factor of rewards in training; returns are reported without it.
+        batched: as in :class:`~proposer_rl.models.Population`.
+        episodes_at_once: of each Solver in evaluations; None for all.
+        observed: entries that are passed to the network, in order.
         memory: width of the network's memory (:func:`~proposer_rl.models.memory_actor_critic`);
             None for a network without.
-        drop_finished: whether evaluations make environments of fewer levels as others are finished,
-            as of :func:`~proposer_rl.learning.mean_performance`.
-        replayed: what reads nothing back from a GPU, and so is replayed there as a CUDA graph:
-            ``"rollouts"`` in an environment whose new levels come to where the old ones were, and
-            of the methods ``"performance"``, ``"probe"`` and ``"measure"``.
+        drop_finished: whether evaluations drop finished levels, as in
+            :func:`~proposer_rl.learning.mean_performance`.
+        replayed: parts that read nothing back from a GPU, and are replayed there as CUDA graphs:
+            ``"rollouts"``, if the environment writes new levels into the memory of the old ones,
+            and the methods ``"performance"``, ``"probe"`` and ``"measure"``.
         batch_size: levels P of an update of one Solver.
         evaluated_on: the fixed evaluation levels [E], by the distributions' names.
 
     Raises:
-        ValueError: naming the key, if there is no distribution of some name.
+        ValueError: naming the key, if there is no distribution of a name.
     """
 
     title: str
@@ -158,8 +159,8 @@ class Task(ABC):
     def environment(self, levels: Levels) -> EnvBase:
         """Returns an environment that plays levels [*B] from its next reset on.
 
-        It has a method ``set_levels(levels [*B])``; it plays those from its next reset on. An
-        episode's success is its entry ``success``, bool [*B, 1], or else that it terminated.
+        Its method ``set_levels(levels [*B])`` replaces them from the next reset on. An episode's
+        success is the entry ``success``, bool [*B, 1], or without one its termination.
         """
 
     def evaluation_environment(self, levels: Levels) -> EnvBase:
@@ -168,12 +169,12 @@ class Task(ABC):
 
     @abstractmethod
     def network(self) -> nn.Module:
-        """Returns one Solver's network, without buffers, drawn from torch's default generator.
+        """Returns one Solver's network without buffers, with weights by torch's default generator.
 
-        It maps what is ``observed``, [*B, ...] each, to logits [*B, A], or locations and log-scales
-        [*B, D, 2] of continuous actions, and values [*B, 1]; with ``memory`` such as
-        :class:`~proposer_rl.models.MemoryNetwork`. It is used unless :meth:`actor_critic` is
-        overridden.
+        It maps the ``observed`` entries, [*B, ...] each, to logits [*B, A], or locations and
+        log-scales [*B, D, 2] of continuous actions, and values [*B, 1]. With ``memory`` it is a
+        network such as :class:`~proposer_rl.models.MemoryNetwork`. It is unused if
+        :meth:`actor_critic` is overridden.
         """
 
     def actor_critic(self, population: Population, env: EnvBase) -> ActorCritic:
@@ -186,7 +187,7 @@ class Task(ABC):
         return ActorCritic(module, distribution_class=distribution, copies=population.copies)
 
     def learner(self, streams: Sequence[Streams]) -> PPO:
-        """Returns PPO of K fresh Solvers, one for each stream, in their environment [K, P]."""
+        """Returns PPO of K new Solvers, one for each stream, in their environment [K, P]."""
         copies, remaining = len(streams), iter(streams)
 
         def network() -> nn.Module:
@@ -201,11 +202,11 @@ class Task(ABC):
         return ppo.replay(rollouts="rollouts" in self.replayed) if self._graphs else ppo
 
     def spectators(self, learner: PPO | Replica) -> tuple[EnvBase, RolloutCollector]:
-        """Returns where the Solvers of a learner play levels [K, P] that they do not train on.
+        """Returns an environment in which a learner's Solvers play levels [K, P] without training.
 
         Returns:
-            The environment, and what rolls out whole episodes there: the learner's own where its
-            rollouts begin with their levels.
+            The environment, and a collector of whole episodes in it. They are the learner's own if
+            its rollouts begin with the episodes.
         """
         horizon = learner.settings.horizon
         if learner.settings.continue_episodes:
@@ -218,11 +219,11 @@ class Task(ABC):
     def performance(
         self, agent: ActorCritic, levels: Levels, generator: torch.Generator
     ) -> TensorDictBase:
-        """Returns what K Solvers reach on levels [E] or [K, E]: a tensordict [K, E].
+        """Returns the performance of K Solvers on levels [E] or [K, E]: a tensordict [K, E].
 
-        ``return`` float [K, E] is the expected return of an episode or an estimate of it,
-        ``success`` the probability of success, where that has a meaning. An exact evaluation has no
-        use for the generator, which is on the CPU.
+        ``return``, float [K, E], is the expected return of an episode or an estimate, and
+        ``success`` the probability of success, if it has a meaning. The generator is on the CPU;
+        exact evaluations do not use it.
         """
         performance = mean_performance(
             agent,
@@ -240,10 +241,10 @@ class Task(ABC):
 
     @torch.no_grad()
     def probe(self, agent: ActorCritic, levels: Levels) -> Tensor:
-        """Returns what K Solvers would do on levels [C], as a Proposer sees it: float [K, C, ...].
+        """Returns a Proposer's observations of K Solvers on levels [C]: float [K, C, ...].
 
-        Here at the beginning of each level: probabilities of n actions, of each choice where there
-        are several, or the means of continuous ones, [K, C, D].
+        By default these are the policies in the first states: probabilities of n actions, or of
+        each option of several choices, or means of continuous actions, [K, C, D].
         """
         copies = for_copies(agent, levels)
         if not copies.batch_size.numel():
@@ -255,34 +256,34 @@ class Task(ABC):
         return logits[..., 0] if continuous else logits.softmax(-1).flatten(2)
 
     def probe_encoder(self, features: int) -> nn.Module:
-        """Returns a network from probes [*B, ...] to features [*B, features], a linear layer."""
+        """Returns a network from probes [*B, ...] to [*B, features]; here a linear layer."""
         return nn.Linear(self._actions, features)
 
     def features(self, levels: Levels) -> Tensor:
-        """Returns what a model of outcomes knows of levels [K, n]: float [K, n, F], -1 to 1.
+        """Returns features of levels [K, n] for a model of outcomes: float [K, n, F], -1 to 1.
 
-        Here by where they lie in the space, which then needs ``locate(levels)``; a task may add
-        others.
+        By default they depend on the levels' coordinates, and the space needs ``locate(levels)``.
         """
         return space_features(self.space, levels)
 
     def inputs(self, levels: Levels) -> Tensor:
-        """Returns what a belief knows of levels [*B]: float64 [*B, D] on the CPU, each -1 to 1.
+        """Returns a belief's inputs for levels [*B]: float64 [*B, D] on the CPU, -1 to 1.
 
-        Here by where they lie in the space, if it has ``locate(levels)``; else D is 0.
+        By default they are the levels' coordinates if the space has ``locate(levels)``; else D is
+        0.
         """
         return level_inputs(self.space, levels)
 
     @property
     def metrics(self) -> list[str]:
-        """Returns the names of what :meth:`measure` gives."""
+        """Returns the names of the results of :meth:`measure`."""
         return [f"{name}_{result}" for name in self.evaluated_on for result in self.results]
 
     def measure(self, agent: ActorCritic) -> TensorDictBase:
         """Returns metrics of K Solvers by name, each float [K]: the columns of ``metrics.csv``.
 
-        Here ``<name>_success`` and ``<name>_return``, means over the evaluation levels of each
-        distribution measured on.
+        By default these are ``<name>_success`` and ``<name>_return``, means over the evaluation
+        levels of each distribution.
         """
         means = {
             f"{name}_{result}": performance[result].mean(1)
@@ -307,7 +308,7 @@ class Task(ABC):
         return distribution.sample(self._levels, self.stream("levels", name))
 
     def evaluation_distribution(self, name: str) -> Distribution:
-        """Returns what the evaluation levels of a distribution are drawn from."""
+        """Returns the distribution from which evaluation levels are drawn."""
         distribution: Distribution = self.distributions[name]
         return distribution
 
@@ -317,10 +318,10 @@ class Task(ABC):
         return Streams(self._seed, scope, name).generator()
 
     def training_metrics(self, levels: Levels, rollout: TensorDictBase) -> TensorDictBase:
-        """Returns what Solvers trained on, levels [K, P] and rollout [K, P, T], by name, each [K].
+        """Returns columns of ``training.csv`` for levels [K, P] and rollout [K, P, T], each [K].
 
-        The columns of ``training.csv``: here means of the entries that are axes of the space, of
-        texts the share of each, and means of the first episodes' success and return.
+        By default these are means of entries that are axes of the space, for texts the share of
+        each, and the means of success and return of first episodes.
         """
         means: dict[str, Tensor] = {}
         bins = getattr(self.space, "bins", {})
@@ -335,10 +336,10 @@ class Task(ABC):
         return TensorDict(means, levels.batch_size[:1])
 
     def record(self, levels: Levels, rollout: TensorDictBase | None) -> list[dict[str, Any]]:
-        """Returns levels [n], and a Solver's steps there [n, T], as pictures and text, for JSON.
+        """Returns records of levels [n], with a Solver's steps there [n, T], for JSON.
 
-        Each record has a ``picture``, a PNG in base64, and may have ``text``, its lines as they
-        are shown in a terminal, and anything else.
+        A record has a ``picture``, a PNG in base64, and may have ``text``, lines for a terminal,
+        and other entries.
         """
         texts = [
             [f"{name} {float(level[name]):.4g}" for name in self._numbers(levels)]
@@ -350,7 +351,7 @@ class Task(ABC):
     def pictures(
         self, levels: Levels, rollout: TensorDictBase | None
     ) -> Sequence[NDArray[np.uint8]]:
-        """Returns pictures uint8 [H, W, 3] for :meth:`record`; without any it shows numbers."""
+        """Returns pictures uint8 [H, W, 3] for :meth:`record`, which shows numbers without any."""
         return []
 
     @property
@@ -360,7 +361,7 @@ class Task(ABC):
 
     @property
     def description(self) -> dict[str, Any]:
-        """The space's axes and the task's names, by which states are compared; for JSON."""
+        """Returns the space's axes and the task's names, to compare states by, for JSON."""
         return {
             "kind": type(self).__qualname__,
             "axes": {name: list(values) for name, values in self.space.axes.items()},
@@ -369,19 +370,19 @@ class Task(ABC):
 
     @property
     def about(self) -> dict[str, str]:
-        """Returns texts about the task by their labels."""
+        """Returns facts about the task for readers, by their labels."""
         names = ", ".join(self.evaluated_on)
         return {"Measured on": f"{names}; {self._levels} fixed levels each"}
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Returns what readers of a run need to know of the task, for JSON.
+        """Returns a description of the task for readers of a run, for JSON.
 
-        - ``title``: of its runs, and ``levels``: what levels are called;
+        - ``title``: of its runs, and ``levels``: a word for levels;
         - ``distributions``: names of those measured on; ``<name>_success`` are their columns;
         - ``space``: the axes of the Proposer's bins;
-        - ``about``: texts by their labels; ``key`` and ``text_key``: what is to be seen in a
-          record's picture and in its text;
+        - ``about``: texts by their labels; ``key`` and ``text_key``: descriptions of a record's
+          picture and of its text;
         - ``measured``: all that must be equal for two runs' metrics to be comparable;
         - ``exact``: whether the metrics draw nothing at random;
         - ``samples``: records (see :meth:`record`) of levels of each distribution measured on.
@@ -408,16 +409,17 @@ class Task(ABC):
     def level_results(
         self, agent: ActorCritic, name: str, max_steps: int | None
     ) -> Sequence[LevelResult]:
-        """Returns what K Solvers reach on each level of a named set, in the set's order.
+        """Returns the results of K Solvers on each level of a named set, in the set's order.
 
         Args:
             agent: K Solvers.
-            name: of the set: here of a distribution, whose evaluation levels are played as
-                :meth:`evaluate` plays them.
-            max_steps: step limit of every level; None for the task's choice. Here nothing else.
+            name: of the set; by default a distribution, whose evaluation levels are played as in
+                :meth:`evaluate`.
+            max_steps: step limit of every level; None for the task's choice, which by default is
+                the only one.
 
         Raises:
-            ValueError: if there is no such set, or its levels are none for these Solvers.
+            ValueError: if there is no such set, or Solvers cannot play its levels.
             StorageError: if a file cannot be read.
         """
         if name not in self.distributions:
@@ -441,7 +443,7 @@ class Task(ABC):
 
     @property
     def _actions(self) -> int:
-        """Returns how many numbers a probe of one level has."""
+        """Returns the count of a probe's numbers for one level."""
         env = self.evaluation_environment(self._placeholders(1, 1))
         spec = env.full_action_spec["action"]
         if isinstance(spec, MultiCategorical):
@@ -449,9 +451,9 @@ class Task(ABC):
         return int(spec.n) if isinstance(spec, Categorical) else int(spec.shape[-1])
 
     def _placeholders(self, *shape: int) -> Levels:
-        """Returns levels of a shape, for an environment whose levels are set later."""
+        """Returns levels of a shape for an environment whose levels are set later."""
         return next(iter(self.evaluated_on.values()))[:1].expand(*shape)
 
     def _numbers(self, levels: Levels) -> list[str]:
-        """Returns axes of the space that are entries of the levels."""
+        """Returns the axes of the space that are entries of the levels."""
         return [name for name in self.space.axes if name in levels.keys()]

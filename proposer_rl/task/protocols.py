@@ -1,9 +1,8 @@
-"""The interface of a task, and optional abilities that some curricula ask for.
+"""The interfaces of a task's parts, and of optional abilities that some curricula need.
 
-K are Solvers, P the levels of one update, E validation levels, N bins. What a task takes as a level
-is its own business: a tensordict or tensorclass of any content, whose batch shape alone matters.
-Curricula that need more than every task has ask for it by name, with the optional parts at the end;
-a task has one by having its members.
+K are Solvers, P the levels of one update, E validation levels, N bins. Levels are a tensordict or
+tensorclass of any content; only their batch shape matters here. A task has an ability if it has the
+members of its protocol.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from torch import Tensor
 from proposer_rl.models import ActorCritic
 from proposer_rl.settings import ArgumentError
 
-MANY_BINS = 256  # beyond which a model of outcomes has no coefficient for each of them
+MANY_BINS = 256  # with more, a model of outcomes has no coefficient for each bin
 MOST_COUNTED = 100_000_000  # bins
 
 Levels = Any
@@ -26,20 +25,20 @@ Levels = Any
 
 
 class NoSuccessError(ValueError):
-    """A task has no success, and it was asked for; the message is a line that says what to do."""
+    """A task without success was asked for it; the message is one line that says what to do."""
 
     exit_code = 2
 
 
 class ComputeContext(NamedTuple):
-    """The device and precision with which a task computes, given to what makes tasks.
+    """The device, precision and cores with which a task computes.
 
     Attributes:
-        device: where Solvers and levels live.
+        device: of Solvers and levels.
         precision: of the Solvers' networks: ``"fp32"``, ``"bf16"``, or ``"auto"`` for the task's
             choice.
         cores: Solvers of a population computed at once on a CPU; None for all cores.
-        graphs: whether a GPU replays what can be recorded as CUDA graphs.
+        graphs: whether a GPU replays recorded CUDA graphs.
         compile: whether gradient steps are compiled.
     """
 
@@ -54,11 +53,11 @@ class Distribution(Protocol):
     """A distribution of levels."""
 
     def sample(self, count: int, generator: torch.Generator, /) -> Levels:
-        """Draws levels [count] on the task's device; the generator is one of the CPU."""
+        """Draws levels [count] on the task's device, by a generator on the CPU."""
 
 
 class Space(Distribution, Protocol):
-    """The levels that a Proposer chooses among, in N bins; ``sample`` draws uniformly from them."""
+    """The levels among which a Proposer chooses, in N bins; ``sample`` draws uniformly."""
 
     @property
     def axes(self) -> Mapping[str, Sequence[float]]:
@@ -73,20 +72,20 @@ class Space(Distribution, Protocol):
 
     @property
     def coordinates(self) -> Tensor:
-        """Returns each bin's place, -1 to 1 along every axis: float32 [N, D] on the CPU."""
+        """Returns each bin's coordinates, -1 to 1 along every axis: float32 [N, D] on the CPU."""
 
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator], /) -> Levels:
-        """Draws levels [K, P] of bins, int64 [K, P], on the task's device; row k by generator k."""
+        """Draws levels [K, P] from bins, int64 [K, P], on the device; generator k draws row k."""
 
 
 class LevelResult(NamedTuple):
-    """One Solver's results on one level, as ``bin/eval`` lists them.
+    """One Solver's results on one level, a row of ``bin/eval``.
 
     Attributes:
         level: the level's name.
-        solver: the Solver's number among those of a population.
-        about: what the level is like, by name.
-        results: the performance, ``success`` and ``return``, and whatever else there is, by name.
+        solver: the Solver's number in its population.
+        about: facts about the level, by name.
+        results: ``success``, ``return`` and others, by name.
     """
 
     level: str
@@ -97,21 +96,21 @@ class LevelResult(NamedTuple):
 
 @runtime_checkable
 class DifferentiableTask(Protocol):
-    """A task whose performance has gradients: first-order gain without sampling."""
+    """A task whose performance has gradients, for first-order gain without sampling."""
 
     def differentiable_performance(self, agent: ActorCritic, levels: Levels) -> TensorDictBase:
-        """Computes return and success of K Solvers on their own levels [K, E], with gradients.
+        """Computes return and success of K Solvers on their own levels [K, E].
 
-        Where gradients are enabled, with gradients towards the agent's parameters.
+        If gradients are enabled, the results have gradients of the agent's parameters.
         """
 
 
 @runtime_checkable
 class LocatedTarget(Protocol):
-    """A task whose target lies in the Proposer's space: a way from other bins to it.
+    """A task whose target lies in the Proposer's space, so that there is a path to it.
 
     Attributes:
-        target_shares: the target as shares of the bins, float [N] on the CPU; they add up to one.
+        target_shares: the target's share in each bin, float [N] on the CPU; they add up to one.
     """
 
     target_shares: Tensor
@@ -119,7 +118,7 @@ class LocatedTarget(Protocol):
 
 @runtime_checkable
 class OptimalTask(Protocol):
-    """A task that knows what could be reached: regret without an antagonist."""
+    """A task that knows the best possible return, for regret without an antagonist."""
 
     def optimal_return(self, levels: Levels) -> Tensor:
         """Returns the largest expected return that a policy reaches on levels [*B]: float [*B]."""
@@ -127,10 +126,10 @@ class OptimalTask(Protocol):
 
 @runtime_checkable
 class EditableTask(Protocol):
-    """A task whose levels can be changed a little."""
+    """A task whose levels can be edited."""
 
     def edit(self, levels: Levels, count: int, generators: Sequence[torch.Generator], /) -> Levels:
-        """Returns levels [K, n] after ``count`` small random edits; row k by generator k."""
+        """Returns levels [K, n] after ``count`` small random edits; generator k edits row k."""
 
 
 class CellKind(NamedTuple):
@@ -138,8 +137,8 @@ class CellKind(NamedTuple):
 
     Attributes:
         mark: its character.
-        name: what it is called, one word.
-        once: whether a drawing has exactly one of it, or of all kinds of its name.
+        name: one word for readers.
+        once: whether a drawing has exactly one cell of this name.
     """
 
     mark: str
@@ -148,7 +147,7 @@ class CellKind(NamedTuple):
 
 
 class Board(Protocol):
-    """Levels as drawings with one character per cell, and all that a Solver does on one."""
+    """Draws levels with one character per cell, and shows what a Solver does on them."""
 
     @property
     def kinds(self) -> Sequence[CellKind]:
@@ -164,83 +163,82 @@ class Board(Protocol):
 
     @property
     def sets(self) -> Sequence[str]:
-        """Names of the shipped sets of levels."""
+        """Names of the included sets of levels."""
 
     def read(self, rows: Sequence[str]) -> Levels:
-        """Returns the level [] that is drawn.
+        """Returns the level [] of a drawing.
 
         Raises:
-            ValueError: if it is none, or none for the Solvers of this task.
+            ValueError: if it is not a level, or not one that this task's Solvers can see.
         """
 
     def draw(self, level: Levels) -> list[str]:
-        """Returns the drawing of a level [], a text for each row; the inverse of :meth:`read`."""
+        """Returns the rows of a level's drawing; the inverse of :meth:`read`."""
 
     def drawing(self, record: Mapping[str, Any]) -> list[str]:
-        """Returns the drawing of the level in one of the task's records."""
+        """Returns the rows of the level's drawing in one of the task's records."""
 
     def level_set(self, name: str) -> Mapping[str, Levels]:
-        """Returns the levels [] of one of the sets, by their names."""
+        """Returns the levels [] of an included set, by name."""
 
     def read_file(self, text: str) -> Mapping[str, Levels]:
-        """Returns the levels [] in the text of a file, by their names.
+        """Returns the levels [] in the text of a file, by name.
 
         Raises:
-            ValueError: if it is no such text.
+            ValueError: if the text has another format.
         """
 
     def write_file(self, name: str, level: Levels) -> str:
         """Returns the text of a file with one level [].
 
         Raises:
-            ValueError: if the name or the level cannot stand in a file.
+            ValueError: if a file cannot hold the name or the level.
         """
 
     def examine(
         self, agent: ActorCritic, solver: int, level: Levels, max_steps: int | None
     ) -> dict[str, Any]:
-        """Returns what one of K Solvers does on a level [] with H x W cells, for JSON.
+        """Returns the behaviour of one of K Solvers on a level [] with H x W cells, for JSON.
 
-        A way is a list of places: row and column, and where an agent turns its direction, too: 0
+        A path is a list of places: row and column, and the direction of an agent that turns: 0
         right, 1 down, 2 left, 3 up.
 
-        - ``results``: numbers by name, ``success`` and ``return`` of the sampled policy among them;
-        - ``episodes``: how many were played for these; absent where they are exact;
-        - ``policy``: for every cell the probability of each action; None where there is none to
-          take: [H][W][A]; absent where a Solver does not act by the cell alone;
-        - ``maps``: further numbers of every cell by what they are, [H][W], None where there is
-          none;
-        - ``paths``: ``solver``, the way of the most probable actions, ``shortest``, or None where
-          there is no path, and without a policy ``sampled``, ways of sampled episodes;
-        - ``next``: where each action leads from each place, [A][H * W], cells counted row by row,
-          or [A][H * W * 4], the directions of each cell one after another;
+        - ``results``: numbers by name, among them ``success`` and ``return`` of the sampled policy;
+        - ``episodes``: count of episodes for these; absent if they are exact;
+        - ``policy``: the probability of each action in every cell, None in cells without one:
+          [H][W][A]; absent if a Solver does not act by the cell alone;
+        - ``maps``: further numbers of every cell by their title, [H][W], or None in a cell;
+        - ``paths``: ``solver``, the path of the most probable actions; ``shortest``, None if there
+          is none; and without a policy ``sampled``, paths of sampled episodes;
+        - ``next``: the place after each action in each place, [A][H * W] with cells counted row by
+          row, or [A][H * W * 4] with four directions of each cell;
         - ``goal``: the cell (row, column) that ends an episode with success;
-        - ``max_steps``, ``step_penalty`` (of an episode that reaches the goal), ``missed`` (the
-          return of one that does not): the rules.
+        - ``max_steps``, ``step_penalty`` (in an episode that reaches the goal) and ``missed`` (the
+          return of an episode that does not).
 
         Args:
             agent: K Solvers.
-            solver: which of them.
-            level: as :meth:`read` gives it.
+            solver: number of one of them.
+            level: as of :meth:`read`.
             max_steps: step limit; None for the task's choice.
 
         Raises:
-            ValueError: if what the Solver answers is no policy.
+            ValueError: if the Solver's output is not a policy.
         """
 
 
 @runtime_checkable
 class PlayableTask(Protocol):
-    """A task whose levels can be drawn, and played in ``bin/play``."""
+    """A task whose levels can be drawn and played in ``bin/play``."""
 
     board: Board
 
 
 def space_features(space: Any, levels: Levels) -> Tensor:
-    """Returns features of levels by where they lie in a space, among the bins or beside them.
+    """Returns features of levels by their coordinates c in a space.
 
-    With c the coordinates of a level: 1, c, c squared, and for each bin whether it is the nearest,
-    unless there are more than :data:`MANY_BINS`.
+    They are 1, c, c squared, and for each bin whether it is the nearest, unless there are more than
+    :data:`MANY_BINS`.
 
     Args:
         space: with ``coordinates`` float [N, D] of its N bins, and ``locate(levels)``, the
@@ -257,21 +255,33 @@ def space_features(space: Any, levels: Levels) -> Tensor:
     if not c.shape[-1]:
         raise ArgumentError(
             "space: must have axes, by which a model of outcomes tells levels apart; levels that "
-            "are seeds alone have none"
+            "are only seeds have none"
         )
     parts = [torch.ones_like(c[..., :1]), c, c.square()]
     if space.size <= MANY_BINS:
-        places = space.coordinates.double()
-        nearest = torch.cdist(c.flatten(0, -2), places).argmin(-1).view(c.shape[:-1])
-        parts.append(torch.nn.functional.one_hot(nearest, len(places)).double())
+        parts.append(torch.nn.functional.one_hot(nearest_bins(space, c), space.size).double())
     return torch.cat(parts, -1)
 
 
-def level_inputs(space: Any, levels: Levels) -> Tensor:
-    """Returns what a belief knows of levels [*B] of a space: float64 [*B, D] on the CPU.
+def nearest_bins(space: Space, places: Tensor) -> Tensor:
+    """Returns the bins of a space that are nearest to places in it.
 
-    That is ``space.inputs(levels)``, where there is such a method, or where they lie,
-    ``space.locate(levels)``; else D is 0.
+    Args:
+        space: with axes.
+        places: as its ``coordinates``, float [*B, D] on the CPU.
+
+    Returns:
+        int64 [*B].
+    """
+    distances = torch.cdist(places.double().flatten(0, -2), space.coordinates.double())
+    return distances.argmin(-1).view(places.shape[:-1])
+
+
+def level_inputs(space: Any, levels: Levels) -> Tensor:
+    """Returns a belief's inputs for levels [*B] of a space: float64 [*B, D] on the CPU.
+
+    They come from ``space.inputs(levels)`` or else ``space.locate(levels)``; without such a method
+    D is 0.
     """
     for name in ("inputs", "locate"):
         if hasattr(space, name):
@@ -281,15 +291,15 @@ def level_inputs(space: Any, levels: Levels) -> Tensor:
 
 
 def for_copies(agent: ActorCritic, levels: Levels) -> Levels:
-    """Expands levels [E], which all K Solvers share, to [K, E]; returns [K, E] as they are."""
+    """Returns levels [K, E], expanded for K Solvers if they share levels [E]."""
     return levels.expand(agent.copies, levels.batch_size[-1])
 
 
 def check_distributions(known: Mapping[str, Any], target: str, measured: Sequence[str]) -> None:
-    """Refuses names of distributions that there are not.
+    """Checks that distributions with these names exist.
 
     Raises:
-        ValueError: naming the key.
+        ValueError: naming the key, if one does not.
     """
     for key, names in (("target", [target]), ("evaluation.distributions", measured)):
         unknown = [name for name in names if name not in known]
@@ -298,7 +308,7 @@ def check_distributions(known: Mapping[str, Any], target: str, measured: Sequenc
 
 
 def refuse_many_bins(space: Space) -> None:
-    """Refuses a space of more bins than can be counted one by one.
+    """Checks that a space has few enough bins to count each.
 
     Raises:
         ArgumentError: if it has more than ``MOST_COUNTED``.
@@ -311,21 +321,13 @@ def refuse_many_bins(space: Space) -> None:
 
 
 def refuse_unfit_bins(space: Space) -> None:
-    """Refuses a space in which there is nothing to choose, or too much.
+    """Checks that a space has several bins, and few enough to count each.
 
     Raises:
-        ValueError: if it has one bin, or see :func:`refuse_many_bins`.
+        ValueError: if it has one bin, or too many for :func:`refuse_many_bins`.
     """
     refuse_many_bins(space)
     if space.size < 2:
         raise ValueError(
             "the space has a single bin, so there is nothing to choose among; give its axes bins"
         )
-
-
-def named(key: str, make: Any, *arguments: Any) -> Any:
-    """Makes something of arguments, and names their key in what is wrong with them."""
-    try:
-        return make(*arguments)
-    except ValueError as error:
-        raise ValueError(f"{key}: {error}") from error

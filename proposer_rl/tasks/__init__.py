@@ -1,7 +1,7 @@
-"""The environments that come along, each in a folder that nothing else knows.
+"""Environments that come with the package, as recipes for :func:`proposer_rl.train`.
 
-``tasks.maze()``, ``tasks.cartpole()`` and so on are recipes, named as the files of ``conf/task``
-and with their settings, for :func:`proposer_rl.train`.
+``tasks.maze()``, ``tasks.cartpole()`` and so on are named as the files of ``conf/task``, and take
+their settings. Nothing outside of an environment's own folder knows it.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from typing import Any
 
 from proposer_rl.recipes import Recipe, available, own_recipe, recipe_function
 
-OF_GYMNASIUM = "gymnasium"  # the file of any environment of Gymnasium; a folder here has its name
+OF_GYMNASIUM = "gymnasium"  # the file of any Gymnasium environment, named as a folder here
 
 
 def from_gymnasium(env_id: str, **settings: Any) -> Recipe:
-    """Returns a task of any environment of Gymnasium, some of whose settings make a level.
+    """Returns a task of any Gymnasium environment, in which some settings make a level.
 
     Args:
         env_id: such as ``"CartPole-v1"``; ``"module:name"`` imports the module first.
@@ -23,13 +23,13 @@ def from_gymnasium(env_id: str, **settings: Any) -> Recipe:
             and the others.
 
     Raises:
-        ArgumentError: for a setting that there is not, with those that there are.
+        ArgumentError: for an unknown setting, listing the known ones.
     """
     return recipe_function("task", OF_GYMNASIUM)(env_id=env_id, **settings)
 
 
 def own(make: Callable[..., Any], **settings: Any) -> Recipe:
-    """Returns a task of one's own: see :func:`proposer_rl.recipes.own_recipe`."""
+    """Returns a task of your own; see :func:`proposer_rl.recipes.own_recipe`."""
     return own_recipe("task", make, **settings)
 
 

@@ -1,10 +1,10 @@
-"""Environments of one's own that step all levels of a batch at once, in torch, as tasks."""
+"""Makes tasks of your own environments that step a batch of levels in torch."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import torch
 from annotated_types import Ge
@@ -15,10 +15,10 @@ from torchrl.envs import EnvBase
 
 from proposer_rl.learning import SolverSettings
 from proposer_rl.models import check_torch_defaults, population
-from proposer_rl.settings import ArgumentError, signed
-from proposer_rl.task import ComputeContext, Levels, Task, named
+from proposer_rl.settings import ArgumentError, signed, within
+from proposer_rl.task import ComputeContext, Levels, Task
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings, solver_network
-from proposer_rl.tasks.gymnasium.player import imported
+from proposer_rl.tasks.gymnasium.player import import_object
 from proposer_rl.tasks.parameters import SEED
 from proposer_rl.tasks.ranges import RangeSettings, spaces
 
@@ -34,10 +34,10 @@ class Step(NamedTuple):
     """The result of a step, in an environment of batch shape [*B].
 
     Attributes:
-        state: float [*B, S], the next one.
+        state: the next state, float [*B, S].
         reward: float [*B].
         terminated: bool [*B].
-        success: whether it is one if the episode ends here, bool [*B].
+        success: whether the episode is a success if it ends here, bool [*B].
     """
 
     state: Tensor
@@ -48,28 +48,28 @@ class Step(NamedTuple):
 
 @signed
 class BatchedEnv(EnvBase):
-    """An environment whose levels are named numbers, and that steps a batch [*B] of them at once.
+    """The base of environments whose levels are named numbers, and that step a batch [*B] at once.
 
-    A class of one's own has to say how large things are (``state_size``, ``observation_size``, and
-    ``actions`` or ``forces``), and to define :meth:`advance`, :meth:`begin` where a state is more
-    than zeros, and :meth:`observe` where a Solver does not see the state alone. Nothing in these
-    may be kept between calls. An episode is truncated after ``max_steps``; its success is the entry
-    ``"success"``, and ``"is_init"`` is whether it begins.
+    Your own class sets the sizes (``state_size``, ``observation_size``, and ``actions`` or
+    ``forces``) and defines :meth:`advance`; :meth:`begin` if a first state is more than zeros; and
+    :meth:`observe` if observations are not just the state. These methods must not keep anything
+    between calls. An episode is truncated after ``max_steps``. The entry ``"success"`` is its
+    success, and ``"is_init"`` whether it begins.
 
-    Whatever is random comes from the level's ``seed`` and the number of the step, so that an
-    episode's chances are the level's own: equal levels and actions make equal episodes.
+    All random numbers come from the level's ``seed`` and the number of the step: equal levels and
+    actions make equal episodes.
 
     Args:
-        levels: [*B], with an entry for each parameter, and a ``seed`` where something is random.
+        levels: [*B], with an entry for each parameter, and a ``seed`` if anything is random.
         max_steps: step limit of an episode.
         device: of the states.
 
     Attributes:
-        state_size: numbers S of a state.
-        observation_size: numbers of an observation.
-        actions: number of discrete actions; None for continuous ones.
-        forces: number of continuous actions, each clipped to -1 to 1.
-        draws: random numbers of a step, and of the beginning.
+        state_size: count S of a state's numbers.
+        observation_size: count of an observation's numbers.
+        actions: count of discrete actions; None for continuous ones.
+        forces: count of continuous actions, each clipped to -1 to 1.
+        draws: count of random numbers for a step, and for the beginning.
     """
 
     state_size: ClassVar[int]
@@ -90,7 +90,7 @@ class BatchedEnv(EnvBase):
         super().__init__(device=device, batch_size=batch, allow_done_after_reset=True)
         self.max_steps = max_steps
         flag = Binary(1, (*batch, 1), dtype=torch.bool)
-        # One entry where a Solver sees the state, which is then neither stored nor reset twice.
+        # One entry if observations are the state, which is then neither stored nor reset twice.
         self._state = "observation" if type(self).observe is BatchedEnv.observe else "state"
         self.observation_spec = Composite(
             {
@@ -111,47 +111,47 @@ class BatchedEnv(EnvBase):
         ends = {key: flag.clone() for key in ("done", "terminated", "truncated")}
         self.done_spec = Composite(ends, shape=batch).to(self.device)
         self._next = {
-            str(name): self._number(entry).to(self.device, copy=True)
-            for name, entry in levels.items()
+            str(name): (one.float() if one.is_floating_point() else one).to(self.device, copy=True)
+            for name, one in levels.items()
         }
         self._level = {name: entry.clone() for name, entry in self._next.items()}
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns the state that episodes begin in, float [*B, S]; here zeros.
+        """Returns the first states of episodes, float [*B, S]; by default zeros.
 
         Args:
-            level: that begins.
-            chance: ``draws`` uniform numbers from 0 to 1, float [*B, draws].
+            level: the parameters of the levels.
+            chance: uniform numbers from 0 to 1, float [*B, draws].
         """
         return torch.zeros(*self.batch_size, self.state_size, device=self.device)
 
     @abstractmethod
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns what an action leads to.
+        """Returns the results of actions.
 
         Args:
             state: float [*B, S].
             action: int64 [*B], or float [*B, forces] from -1 to 1.
-            level: that is played.
-            chance: as of :meth:`begin`, others at every step.
+            level: the parameters of the levels.
+            chance: as in :meth:`begin`, with other numbers at every step.
         """
 
     def observe(self, state: Tensor, level: Values) -> Tensor:
-        """Returns what a Solver sees, float [*B, observation_size]; here the state."""
+        """Returns observations, float [*B, observation_size]; by default the state."""
         return state
 
     @classmethod
     def features(cls, level: Values) -> Tensor:
-        """Returns what else a model of outcomes knows of levels, float [*B, F]; here nothing."""
+        """Returns more features of levels for models of outcomes, float [*B, F]; here none."""
         return next(iter(level.values())).unsqueeze(-1)[..., :0]
 
     def set_levels(self, levels: TensorDictBase) -> None:
-        """Sets levels [*B], each of which is played from its own next reset on."""
+        """Sets levels [*B], which are played from their next resets on."""
         for name, place in self._next.items():
             place.copy_(levels[name])
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Begins ended episodes anew, without asking a GPU first whether there are any."""
+        """Begins finished episodes anew, without waiting for a GPU to tell if there are any."""
         done = tensordict["done"]
         if population.at_hand(done):
             return super().maybe_reset(tensordict)
@@ -161,11 +161,11 @@ class BatchedEnv(EnvBase):
         )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
-        # Of these TorchRL takes over only the entries of the levels that are reset.
+        # TorchRL takes these entries only for the levels that are reset.
         return self._begun(None if tensordict is None else tensordict.get("_reset", None))
 
     def _begun(self, which: Tensor | None) -> TensorDict:
-        """Takes up the levels that are set, those of bool [*B, 1] or all, and begins all anew."""
+        """Takes the levels that were set, those of bool [*B, 1] or all, and begins all anew."""
         for name, following in self._next.items():
             level = self._level[name]
             level.copy_(following if which is None else following.where(which.squeeze(-1), level))
@@ -201,29 +201,25 @@ class BatchedEnv(EnvBase):
         return TensorDict(entries, self.batch_size, device=self.device)
 
     def _chance(self, steps: Tensor) -> Tensor:
-        """Returns the uniform numbers of steps int64 [*B, 1]: float [*B, draws]."""
+        """Returns uniform numbers for steps int64 [*B, 1]: float [*B, draws]."""
         if not self.draws:
             return steps.new_zeros(*self.batch_size, 0, dtype=torch.float32)
         return uniform(self._level[SEED].unsqueeze(-1), steps, self.draws)
 
-    @staticmethod
-    def _number(entry: Tensor) -> Tensor:
-        return entry.float() if entry.is_floating_point() else entry
-
     def _set_seed(self, seed: int | None) -> None:
-        """Does nothing: what is random comes from the levels' seeds."""
+        """Does nothing: random numbers come from the levels' seeds."""
 
 
 def uniform(seed: Tensor, step: Tensor, count: int) -> Tensor:
-    """Returns numbers that look uniform from 0 to 1, the same for equal seeds and steps.
+    """Returns pseudorandom uniform numbers from 0 to 1, equal for equal seeds and steps.
 
-    The finalizer of SplitMix64 (Steele et al. 2014, "Fast Splittable Pseudorandom Number
-    Generators", OOPSLA) of both and of the number's place.
+    They are hashes of seed, step and their place by the finalizer of SplitMix64 (Steele et al.
+    2014, "Fast Splittable Pseudorandom Number Generators", OOPSLA).
 
     Args:
         seed: int64 [*B, 1].
         step: int64 [*B, 1].
-        count: of the numbers.
+        count: of numbers.
 
     Returns:
         float32 [*B, count], below 1.
@@ -238,18 +234,18 @@ def uniform(seed: Tensor, step: Tensor, count: int) -> Tensor:
 
 
 def finalized(x: Tensor) -> Tensor:
-    """Returns int64 numbers each of whose bits depends on all bits of those given."""
+    """Returns hashes of int64 numbers, in which every bit depends on all bits of the number."""
     for shift, factor in zip(SHIFT, (*MIX, 1), strict=True):
         x = (x ^ (x >> shift & (1 << 64 - shift) - 1)) * factor
     return x
 
 
 class BatchedTask(Task):
-    """A :class:`~proposer_rl.tasks.batched_envs.BatchedEnv` some of whose numbers make a level.
+    """A task of a :class:`~proposer_rl.tasks.batched_envs.BatchedEnv` with named parameters.
 
     Args:
         env: dotted name of the environment's class.
-        max_steps: of an episode.
+        max_steps: step limit of an episode.
         parameters: what differs between levels, by name.
         network: of the Solver.
         levels: fixed evaluation levels of each distribution.
@@ -257,11 +253,10 @@ class BatchedTask(Task):
         context: device, precision and cores.
 
     Attributes:
-        seeded: whether levels have seeds, which random numbers come from.
+        seeded: whether levels have seeds, from which random numbers come.
 
     Raises:
-        ArgumentError: naming the key, if there is no such class, or for a parameter that is no
-            range.
+        ArgumentError: naming the key, if there is no such class, or a parameter is not valid.
     """
 
     noun = "levels"
@@ -305,7 +300,7 @@ class BatchedTask(Task):
 
     @property
     def about(self) -> dict[str, str]:
-        """Returns texts about the task by their labels."""
+        """Returns facts about the task for readers, by their labels."""
         target = "; ".join(f"{name} {bins}" for name, bins in self.target.bins.items())
         return {"Target": target, **super().about}
 
@@ -314,11 +309,11 @@ class BatchedTask(Task):
         return self._class(levels, max_steps=self.max_steps, device=self.device)
 
     def features(self, levels: Levels) -> Tensor:
-        """Returns where levels [K, n] lie and the environment's own features: float [K, n, F]."""
+        """Returns features of where levels [K, n] lie, and the environment's: float [K, n, F]."""
         return torch.cat([super().features(levels), self._own_features(levels)], -1)
 
     def inputs(self, levels: Levels) -> Tensor:
-        """Returns the environment's own features of levels [*B], or else where they lie."""
+        """Returns the environment's own features of levels [*B], or without any where they lie."""
         own = self._own_features(levels)
         return own if own.shape[-1] else super().inputs(levels)
 
@@ -334,7 +329,8 @@ class BatchedTask(Task):
 
 
 def _environment_class(name: str) -> type[BatchedEnv]:
-    kind = named("env", imported, name)
+    with within("env", ValueError):
+        kind: Any = import_object(name)
     if not (isinstance(kind, type) and issubclass(kind, BatchedEnv)):
         raise ArgumentError(f"env={name!r}: must be a subclass of BatchedEnv")
     return kind

@@ -1,4 +1,4 @@
-"""A point mass before a wall with a gate: the environment in TorchRL, and the task."""
+"""The point mass before a wall with a gate, as a TorchRL environment and as a task."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ BORDER = 4.0  # of positions, on every side
 FORCE, GAIN = 10.0, 1.5  # the largest, and acceleration per force
 SUBSTEPS, DT = 10, 0.01  # of a step, and their seconds
 STEEPNESS = 0.6  # of the reward
-NEAR = 0.25  # from the goal is a success
+NEAR = 0.25  # distance from the goal that is a success
 
 
 class PointMassEnv(BatchedEnv):
-    """Point masses that are to get through a gate in a wall and to stay at a goal, a batch of them.
+    """Point masses that must get through a gate in a wall and stay at a goal, as a batch.
 
     The environment of Klink et al. 2020 ("Self-Paced Deep Reinforcement Learning", arXiv
     2004.11812) and 2022 ("Curriculum Reinforcement Learning via Constrained Optimal Transport",
     ICML), without the noise of their accelerations (a deviation of 0.05, which hardly moves a
-    mass): nothing is drawn at random.
+    mass). Nothing is drawn at random.
 
     - Level: ``position`` and ``width`` of the gate, and ``friction``.
     - Action: float32 ``[*B, 2]``, the force along x and y in shares of the largest, 10, held for a
-      tenth of a second. What is beyond -1 and 1 is clipped.
-    - Observation, which is the state: float32 ``[*B, 7]``: x, its speed, y, its speed, and the
-      level: the gate's position and width, and the friction.
+      tenth of a second and clipped to -1 to 1.
+    - Observation, which is also the state: float32 ``[*B, 7]``: x, its speed, y, its speed, and the
+      level's position, width and friction.
     - Dynamics: ten Euler steps of 0.01 seconds; the acceleration is 1.5 times the force, less
       friction times the speed. Positions stay within -4 and 4. The mass begins at rest at (0, 3).
     - Reward: float32 ``[*B, 1]``, exp(-0.6 d) at the distance d from the goal at (0, -3).
-    - End: ``terminated`` where the mass hits the wall, the line y = 0 beside the gate, and stops
-      there; ``truncated`` after ``max_steps``. ``"success"``, bool ``[*B, 1]``, is whether an
-      episode ends with the time limit and less than 0.25 from the goal.
+    - End: ``terminated`` when the mass hits the wall, the line y = 0 beside the gate, where it
+      stops; ``truncated`` after ``max_steps``. ``"success"``, bool ``[*B, 1]``, is whether an
+      episode ends by the time limit less than 0.25 from the goal.
 
     Example:
         >>> from tensordict import TensorDict
@@ -63,13 +63,13 @@ class PointMassEnv(BatchedEnv):
     forces = 2
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns the initial state: the mass at rest, and its level."""
+        """Returns the first state: the mass at rest, and its level."""
         x, y = (torch.full_like(level[GATE[0]], place) for place in START_PLACE)
         rest = torch.zeros_like(x)
         return torch.stack([x, rest, y, rest, *(level[name] for name in GATE)], -1)
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns the step's result: the mass's state after ten substeps."""
+        """Returns the result of a step of ten substeps."""
         place, speed, hit = after_substeps(state, action)
         away = torch.hypot(place[0] - GOAL_PLACE[0], place[1] - GOAL_PLACE[1])
         mass = torch.stack([place[0], speed[0], place[1], speed[1]], -1)
@@ -78,14 +78,14 @@ class PointMassEnv(BatchedEnv):
 
 
 def after_substeps(state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns where masses are after a step, and whether they hit the wall on their way.
+    """Returns places and speeds after a step, and whether masses hit the wall on their way.
 
     Args:
         state: of masses, float [*B, 7].
         action: forces in shares of the largest, float [*B, 2] from -1 to 1.
 
     Returns:
-        Places and speeds along x and y, float [2, *B], and bool [*B].
+        Places and speeds along x and y, float [2, *B], and hits, bool [*B].
     """
     x, x_speed, y, y_speed, gate, width, friction = state.unbind(-1)
     place, speed = torch.stack([x, y]), torch.stack([x_speed, y_speed])
@@ -107,12 +107,12 @@ def after_substeps(state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tenso
     return at_wall.where(hit, place), speed.masked_fill(hit, 0), hit
 
 
-SIDE_PIXELS = 120  # pixels of a picture
+SIDE_PIXELS = 120  # of a picture
 
 
 @settings
 class GateSettings:
-    """Settings of what differs between levels.
+    """Settings of the parameters that differ between levels.
 
     Attributes:
         position: of the gate's middle along the wall.
@@ -126,19 +126,19 @@ class GateSettings:
 
 
 class PointMassTask(BatchedTask):
-    """A point mass that is to get through a gate in a wall, and to stay at a goal behind it.
+    """A point mass that must get through a gate in a wall, and stay at a goal behind it.
 
     Args:
-        max_steps, network, levels, solver, context: as of
+        max_steps, network, levels, solver, context: as in
             :class:`~proposer_rl.tasks.batched_envs.BatchedTask`.
         parameters: what differs between levels.
 
     Raises:
-        ValueError: naming the key, for a parameter that is no range.
+        ArgumentError: naming the key, if a parameter is not valid.
     """
 
     title, noun, seeded = "point mass", "gates", False
-    key = "The wall with its gate, the goal (orange), and the way of the mass."
+    key = "The wall with its gate, the goal (orange), and the path of the mass."
 
     def __init__(
         self,

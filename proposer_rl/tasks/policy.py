@@ -1,4 +1,4 @@
-"""A trained Solver as a policy for other code: Gymnasium's, TorchRL's, and torch alone."""
+"""Makes a trained Solver a policy for code of Gymnasium, TorchRL, or torch alone."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ from proposer_rl.tasks.gymnasium.task import GymnasiumTask
 Space = spaces.Space[Any]
 Memory = tuple[Tensor, ...]
 BEGINS = "is_init"
-EXAMPLES = 2  # rows of the batch that an export is traced with; a single one would be a constant
+EXAMPLES = 2  # rows of the batch that traces an export; a single one would be a constant
 
 
 class Policy(TensorDictModuleBase):
-    """Acts by one trained Solver, on observations of the environment's own space.
+    """A trained Solver that acts on observations of the environment's own space.
 
-    :meth:`predict` is that of Stable-Baselines3's policies, :meth:`save` writes a file that torch
-    alone can load, and as a module this is a TorchRL actor. It reads the entries that TorchRL's
-    ``GymEnv(..., categorical_action_encoding=True)`` makes of the space, or those of the task's own
-    TorchRL environment, of any batch shape, and writes ``action``: the most probable one where
-    nothing else is said, a drawn one under ``set_exploration_type(ExplorationType.RANDOM)``, as in
-    TorchRL's collectors. No gradients flow.
+    :meth:`predict` works as in Stable-Baselines3's policies, and :meth:`save` writes a file that
+    torch alone can load. As a module this is a TorchRL actor: it reads the entries of TorchRL's
+    ``GymEnv(..., categorical_action_encoding=True)``, or those of the task's own TorchRL
+    environment, of any batch shape, and writes ``action``. That is the most probable action, or a
+    sampled one under ``set_exploration_type(ExplorationType.RANDOM)``, as in TorchRL's collectors.
+    No gradients flow.
 
     Args:
         agent: one Solver, with ``copies=1``.
         observation_space, action_space: of one environment, without a batch.
-        plain: whether the agent sees and acts by a
-            :class:`~proposer_rl.tasks.gymnasium.spaces.Layout` of these spaces; else it takes each
-            part by its name, and gives actions as they are.
+        plain: whether a :class:`~proposer_rl.tasks.gymnasium.spaces.Layout` converts between these
+            spaces and the agent; else the agent reads each part by its name, and its actions are
+            those of the space.
     """
 
     def __init__(
@@ -73,19 +73,19 @@ class Policy(TensorDictModuleBase):
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Any, tuple[Any, ...] | None]:
-        """Returns actions for an observation, or for a batch of them as a vector environment's.
+        """Returns actions for an observation, or for a batch of them from a vector environment.
 
         Args:
             observation: of the observation space: numbers, arrays, dictionaries and tuples.
-            state: the memory that the call before returned; None where all episodes begin.
-            episode_start: whether an episode begins, and its memory is cleared, a truth value or
-                bool [n]; None for no.
-            deterministic: whether to take the most probable action, or to draw one, from torch's
+            state: the memory that the last call returned; None at the beginning of episodes.
+            episode_start: whether an episode begins, which clears its memory: a truth value or bool
+                [n]; None for no.
+            deterministic: whether to take the most probable action, or to sample one by torch's
                 default generator.
 
         Returns:
-            The action of the action space, or a batch of actions as a vector environment takes
-            them; and the memory, None for a Solver without.
+            An action of the action space, or a batch of actions for a vector environment; and the
+            memory, None for a Solver without.
 
         Raises:
             ValueError: if a part of the observation has another shape than its space.
@@ -122,20 +122,20 @@ class Policy(TensorDictModuleBase):
         return tensordict
 
     def primer(self) -> TensorDictPrimer:
-        """Returns the TorchRL transform that carries the memory; it comes after ``InitTracker``."""
+        """Returns the TorchRL transform for the memory, to be put after ``InitTracker``."""
         return self.agent.primer()
 
     def save(self, path: str | PathLike[str], *, deterministic: bool = True) -> None:
-        """Writes the policy by ``torch.export``, for any batch size.
+        """Saves the policy by ``torch.export``, for any batch size.
 
-        ``torch.export.load(path).module()`` then takes a batch of observations as tensors, in the
+        ``torch.export.load(path).module()`` takes a batch of observations as tensors in the
         structure of the observation space, and returns actions in that of the action space. With
-        memory it takes this, two tensors [n, M], zeros at first, and whether episodes begin, bool
-        [n], besides, and returns ``(action, memory)``.
+        memory it also takes the memory, two tensors [n, M] that are zero at first, and whether
+        episodes begin, bool [n], and returns ``(action, memory)``.
 
         Args:
-            path: of the file, by custom ending in ``.pt2``.
-            deterministic: as of :meth:`predict`.
+            path: of the file, usually with the suffix ``.pt2``.
+            deterministic: as in :meth:`predict`.
         """
         device = next(self.parameters()).device
         observation = create_empty_array(self.observation_space, EXAMPLES)
@@ -145,7 +145,7 @@ class Policy(TensorDictModuleBase):
             given += (tuple(memory.values()), np.zeros(EXAMPLES, np.bool_))
         given = tree_map(lambda part: torch.as_tensor(part, device=device), given)
         module = _Exported(self, sample=not deterministic)
-        module(*given)  # what is computed once and kept are numbers then, not traces of them
+        module(*given)  # so that constants are computed before the trace
         sizes = tree_map(lambda _: {0: torch.export.Dim("batch")}, given)
         torch.export.save(torch.export.export(module, given, dynamic_shapes=sizes), path)
 
@@ -156,10 +156,10 @@ class Policy(TensorDictModuleBase):
         """Returns the parts of actions [*B], and the memory after the step.
 
         Args:
-            shown: parts of observations [*B, ...], in the order of those of their space.
+            shown: parts of observations [*B, ...], in the order of the space's parts.
             memory: before the step, [*B, M] each; None for the first step.
             begins: whether episodes begin, bool [*B]; None without memory.
-            sample: whether to draw the action.
+            sample: whether to sample the action.
         """
         agent, batch = self.agent, self._batch(shown)
         if self._layout is None:
@@ -186,7 +186,7 @@ class Policy(TensorDictModuleBase):
         return own, tuple(after) or None
 
     def _batch(self, shown: list[Tensor], batch: torch.Size | None = None) -> torch.Size:
-        """Returns the batch shape [*B] of an observation's parts, which may be known."""
+        """Returns the batch shape [*B] of an observation's parts, and checks their shapes."""
         parts = list(leaves(self.observation_space))
         if batch is None:
             batch = shown[0].shape[: shown[0].ndim - len(parts[0][1].shape)]
@@ -203,7 +203,7 @@ def policy_of(task: Task, learner: PPO) -> Policy:
     """Returns the only Solver of a task's learner as a policy.
 
     Raises:
-        ValueError: if the task has transforms, which change what a plain environment shows.
+        ValueError: if the task has transforms, which a plain environment lacks.
     """
     if isinstance(task, GymnasiumTask):
         return Policy(learner.agent, *task.own_spaces(), plain=True)
@@ -228,13 +228,13 @@ def _space(spec: TensorSpec) -> Space:
 
 
 def _key(name: str, *before: str) -> Any:
-    """Returns the entry of a tensordict for a dotted name."""
+    """Returns the key of a tensordict for a dotted name."""
     key = (*before, *filter(None, name.split(".")))
     return key[0] if len(key) == 1 else key or None
 
 
 class _Exported(nn.Module):
-    """A policy with the structure of its spaces, without anything that is not torch's."""
+    """A policy on tensors in the structure of its spaces, which torch can export."""
 
     def __init__(self, policy: Policy, *, sample: bool) -> None:
         super().__init__()

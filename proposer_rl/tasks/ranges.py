@@ -1,11 +1,10 @@
-"""Ranges of parameters and their targets, as given in files and in Python.
+"""Reads ranges of parameters and their targets, from files and from Python.
 
-A parameter is a continuous range, whole numbers, or choices; :func:`read_line` and
-:class:`LineSettings` make bins of it, :func:`read_part` of a part of it, such as the target.
+A parameter is a continuous range, whole numbers, or choices. :func:`read_line` and
+:class:`LineSettings` make bins of it, and :func:`read_part` of a part of it, such as the target.
 """
 
 # Annotations are objects here, not texts: settings of other modules inherit the fields.
-import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -18,7 +17,15 @@ from annotated_types import Ge, Le, Len
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from proposer_rl.settings import ArgumentError, Positive, arguments, plain, settings, shown
+from proposer_rl.settings import (
+    ArgumentError,
+    Positive,
+    arguments,
+    plain,
+    settings,
+    shown,
+    within,
+)
 from proposer_rl.tasks.parameters import (
     MOST_BINS,
     SEED,
@@ -30,7 +37,7 @@ from proposer_rl.tasks.parameters import (
     points,
 )
 
-# Columns of the table of training, where parameters have one each, too; beside PPO's ``loss_...``.
+# Other columns of training.csv, which has one for each parameter; besides PPO's ``loss_...``.
 OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_norm"}
 RESERVED = {SEED, "updates", "train_success", "train_return", *OF_PPO}
 
@@ -39,14 +46,14 @@ RESERVED = {SEED, "updates", "train_success", "train_return", *OF_PPO}
 class LineSettings:
     """Settings of a parameter's values.
 
-    Either ``values``, each of which is a bin, or a range from ``low`` to ``high`` in ``bins`` equal
-    parts, within which it is drawn uniformly.
+    They are either ``values``, each of which is a bin, or a range from ``low`` to ``high`` in
+    ``bins`` equal parts, which values are drawn from uniformly.
 
     Attributes:
-        values: rising numbers, whole if all are; or texts, truth values and the like, in any order.
+        values: rising numbers; or texts, truth values and the like, in any order.
         low, high, bins: of a range.
-        log: whether the logarithms of its numbers are what is uniform, cut into equal parts,
-            interpolated and compared.
+        log: whether numbers are drawn, cut into equal parts, interpolated and compared by their
+            logarithms.
     """
 
     values: Annotated[list[Any], Len(1, MOST_BINS)] | None = None
@@ -56,11 +63,11 @@ class LineSettings:
     log: bool = False
 
     def space_bins(self, count: int = 1) -> Bins:
-        """Returns the bins, of a range as many as are given where it does not say how many.
+        """Returns the bins, of which a range has the given count if the settings have none.
 
         Raises:
-            ValueError: if it has neither values nor a range, both, or they do not rise, or are not
-                above 0 on a logarithmic scale.
+            ValueError: if there are neither values nor a range, or both; if they do not rise, or
+                are not above 0 on a logarithmic scale.
         """
         low, high, bins = self.low, self.high, self.bins
         if self.values is not None and (low, high, bins) == (None, None, None):
@@ -72,31 +79,31 @@ class LineSettings:
 
 @settings
 class RangeSettings(LineSettings):
-    """A number that differs between levels, and what of it is to be mastered.
+    """Settings of a number that differs between levels, and of its target.
 
     Attributes:
-        target: a number; of ``values`` one or several, equally likely; of a range also [from, to].
-            Or a mapping: ``values`` with their ``weights``, which need not add up to one, or a
-            normal distribution that is cut off at the range's ends, as ``distribution: norm`` with
-            ``loc`` and ``scale``.
+        target: the part to be mastered: a number, or several that are equally likely; of a range,
+            two numbers are ``[from, to]``. Or a mapping: ``values`` with their ``weights``, which
+            need not add up to one; or ``distribution: norm`` with ``loc`` and ``scale`` for a
+            normal distribution whose tails beyond the range lie at its ends.
     """
 
     values: Annotated[list[Number], Len(1, MOST_BINS)] | None = None
     target: Number | Annotated[list[Number], Len(1)] | dict[str, Any]
 
     def target_bins(self) -> Bins:
-        """Returns what of the parameter the Solver is to master.
+        """Returns the bins of the target.
 
         Raises:
-            ValueError: if it is no part of the parameter, nor a distribution on it.
+            ValueError: if it is neither a part of the parameter nor a distribution on it.
         """
         line = self.space_bins()
         return read_part("target", target_in_file(self.target, line), line)
 
     @property
     def measured(self) -> dict[str, Any]:
-        """Returns what must be equal for measurements to be comparable."""
-        # Runs from before there were these are comparable where they are not used.
+        """Returns the settings that must be equal for results to be comparable, for JSON."""
+        # Older runs lack these settings, and are comparable to runs that do not use them.
         new = ("log", "to")
         return {key: value for key, value in asdict(self).items() if key not in new or value}
 
@@ -105,12 +112,12 @@ class RangeSettings(LineSettings):
 class Log:
     """A continuous range on a logarithmic scale, for :class:`~proposer_rl.Parameters`.
 
-    Its bins are equal in ratio, draws in a bin are log-uniform, and small edits, interpolation and
-    what a belief sees go by the logarithm.
+    Bins are equal in ratio, draws in a bin are log-uniform, and small edits, interpolation and a
+    belief's inputs go by the logarithm.
 
     Attributes:
         low: above 0.
-        high: above that.
+        high: above ``low``.
 
     Example:
         >>> import proposer_rl as prl
@@ -124,17 +131,17 @@ class Log:
 
 @dataclass(frozen=True)
 class Labelled(Bins):
-    """The places of texts, or whatever else is chosen from, in their list, which has no order.
+    """Bins of choices without an order, such as texts; a level has the place in their list.
 
     Attributes:
-        labels: all that is chosen from.
+        labels: the choices.
     """
 
     labels: list[Any]
 
     @property
     def middles(self) -> list[Any]:
-        """Returns the label of each part, as a text."""
+        """Returns the label of each part as a text."""
         return [" ".join(str(label).split()) for label in self.named(self.low)]
 
     def named(self, values: Tensor) -> list[Any]:
@@ -143,26 +150,26 @@ class Labelled(Bins):
 
     @property
     def texts(self) -> list[str]:
-        """Returns the labels as texts, with their places where two are alike."""
+        """Returns the labels as texts, with their places if two are alike."""
         texts = self.middles
         alike = len({*texts}) < len(texts)
         return [f"{place}: {text}" for place, text in enumerate(texts)] if alike else texts
 
     def between(self, a: Tensor, b: Tensor, share: Tensor, noise: Tensor) -> Tensor:
-        """Returns one of two choices each: b in so many of all draws as the share says."""
+        """Returns one of two choices each, b with a probability of the share."""
         return torch.where(share < 0.5, a, b)
 
     def means(self, name: str, values: Tensor) -> dict[str, Tensor]:
-        """Returns the share of each label among values [K, P], [K], by the names of both."""
+        """Returns the share of each label among values [K, P], [K], by ``name=label``."""
         shares = one_hot(values, len(self.labels)).double().mean(-2)
         return {f"{name}={text}": shares[..., i] for i, text in enumerate(self.texts)}
 
     def columns(self, values: Tensor, scaled: Tensor) -> Tensor:
-        """Returns which of the listed values [*B] are, 1 or 0: float64 [*B, c]."""
+        """Returns values [*B] one-hot, float64 [*B, c]."""
         return one_hot(values, len(self.labels)).double()
 
     def moved(self, old: Tensor, noise: Tensor) -> Tensor:
-        """Returns another place for each of [n], drawn by its noise, float64 [n]."""
+        """Returns another place for each of [n], chosen by noise, float64 [n]."""
         count = len(self.low)
         further = 1 + (noise.abs() * 1e6).long() % max(count - 1, 1)
         return (old + further) % count
@@ -172,11 +179,11 @@ class Labelled(Bins):
 
 
 def choice_bins(values: list[Any], log: bool = False) -> Bins:
-    """Returns a bin for each of some rising numbers, or of whatever else there is to choose from.
+    """Returns a bin for each of some rising numbers, or for each choice of any other kind.
 
     Raises:
-        ValueError: for numbers that do not rise, or are too large; for a text or a truth value that
-            comes twice; for a logarithmic scale of what is not above 0.
+        ValueError: for numbers that do not rise or are too large, texts or truth values that occur
+            twice, or a logarithmic scale of anything but numbers above 0.
     """
     numbers = all(map(is_real, values))
     if log and not (numbers and values[0] > 0):
@@ -191,24 +198,24 @@ def choice_bins(values: list[Any], log: bool = False) -> Bins:
 
 
 def read_line(key: str, given: Any, count: int = 1) -> Bins:
-    """Returns the bins of what Python says of a parameter.
+    """Returns the bins of a parameter as Python describes it.
 
     Args:
         key: of the parameter, for errors.
         given: ``(low, high)`` for a continuous range, or :class:`Log`; ``range(a, b)`` for whole
             numbers; a list or an array of choices; or a mapping with the entries of
             :class:`LineSettings`.
-        count: equal parts of a range.
+        count: of the parts of a range.
 
     Raises:
-        ArgumentError: if it is nothing of that.
+        ArgumentError: if it is none of these.
     """
     given = python_values(given)
-    try:
+    with within(key, ValueError, OverflowError, lead=f"{key}={shown(given)}: "):
         if isinstance(given, Mapping):
             return LineSettings(**given).space_bins(count)
         if isinstance(given, range):
-            points(sorted({given.start, given.stop}))  # refuses what int64 cannot hold
+            points(sorted({given.start, given.stop}))  # refuses numbers beyond int64
         if isinstance(given, range) and given.step == 1 and len(given) > count:
             edges = torch.linspace(given.start, given.stop, count + 1, dtype=torch.float64)
             low = edges[:-1].ceil().long()
@@ -220,74 +227,59 @@ def read_line(key: str, given: Any, count: int = 1) -> Bins:
         if isinstance(given, list | range) and len(given):
             return choice_bins(list(given))
         raise ValueError("must be (low, high), a range or a list")
-    except ArgumentError as error:  # of an entry
-        raise ArgumentError(f"{key}.{error}") from error
-    except (ValueError, OverflowError) as error:
-        raise ArgumentError(f"{key}={shown(given)}: {error}") from error
 
 
 def read_part(key: str, given: Any, line: Bins) -> Bins:
-    """Returns a part of a parameter's line, of the type of its values.
+    """Returns a part of a parameter's bins, in the dtype of its values.
 
     Args:
         key: of the part, for errors.
-        given: a value, or several that are equally likely, of choices some of these; of a range
-            also a part of it as in :func:`read_line`. Or a mapping with the arguments of
-            :func:`weighted_law` or :func:`normal_law`.
-        line: the parameter's.
+        given: a value, or several that are equally likely; of a range also a part of it, as in
+            :func:`read_line`. Or a mapping with the arguments of :func:`weighted_law` or
+            :func:`normal_law`.
+        line: the parameter's bins.
 
     Raises:
-        ArgumentError: if it is none.
+        ArgumentError: if it is not a part of the line.
     """
     given = python_values(given)
     if isinstance(given, Mapping):
         law = normal_law if "distribution" in given else weighted_law
-        try:
+        with within(key):
             return law(line, **arguments(law, given, ("line",)))
-        except ArgumentError as error:
-            raise ArgumentError(f"{key}.{error}") from error
     if isinstance(line, Labelled):
         chosen = given if isinstance(given, list) and given not in line.labels else [given]
-        if not chosen or any(
-            value not in line.labels or chosen.count(value) > 1 for value in chosen
-        ):
+        if not chosen or any(one not in line.labels or chosen.count(one) > 1 for one in chosen):
             raise ArgumentError(f"{key}={given!r}: must be among {line.labels}, each once")
         places = torch.tensor(sorted(map(line.labels.index, chosen)))
         return replace(line, low=places, high=places)
     many = [given] if is_real(given) else given
-    if isinstance(many, list) and not all(map(is_real, many)):
-        raise ArgumentError(f"{key}={shown(given)}: must be a number, (from, to) or a list of them")
     part = read_line(key, many)
-    if not line.low.is_floating_point() and part.low.is_floating_point():
-        raise ArgumentError(
-            f"{key}={given}: must be whole, as the range is: one, a list or range(from, to + 1)"
-        )
-    part = Bins(part.low.to(line.low), part.high.to(line.high), log=part.log or line.log)
-    if part.log and part.low[0] <= 0:
-        raise ArgumentError(f"{key}={shown(given)}: must be above 0 on a logarithmic scale")
-    if not line.wide and (part.wide or not torch.isin(part.low, line.low).all()):
-        raise ArgumentError(f"{key}={given}: must be among {line.low.tolist()}")
+    log, fault = part.log or line.log, ""
+    if isinstance(part, Labelled):
+        fault = "must be a number, (from, to) or a list of them"
+    elif not line.low.is_floating_point() and part.low.is_floating_point():
+        fault = "must be whole, as the range is: one, a list or range(from, to + 1)"
+    elif log and part.low[0] <= 0:
+        fault = "must be above 0 on a logarithmic scale"
+    part = Bins(part.low.to(line.low), part.high.to(line.high), log=log)
+    if not (fault or line.wide) and (part.wide or not torch.isin(part.low, line.low).all()):
+        fault = f"must be among {line.low.tolist()}"
+    if fault:
+        raise ArgumentError(f"{key}={shown(given)}: {fault}")
     return part
 
 
 def target_in_file(target: Any, line: Bins) -> Any:
-    """Returns a target as Python has it: files have no tuples, and their ``[from, to]`` is one.
-
-    Raises:
-        ArgumentError: for another list in a range, which could be read in two ways.
-    """
-    if not line.wide or not isinstance(target, list) or len(target) == 1:
-        return target
-    if len(target) > 2:
-        raise ArgumentError(f"target={target}: must be a number or [from, to]")
-    return tuple(target)
+    """Returns a target of a file as in Python: ``[from, to]`` of a range becomes a tuple."""
+    return tuple(target) if line.wide and isinstance(target, list) and len(target) == 2 else target
 
 
 def weighted_law(line: Bins, values: Annotated[list[Any], Len(1)], weights: list[Positive]) -> Law:
-    """Returns single values of a line that are more or less likely.
+    """Returns a distribution over single values with weights.
 
     Raises:
-        ArgumentError: if there is not a weight for each, or one is no value of the line.
+        ArgumentError: if weights are missing, or a value is not one of the line.
     """
     if len(weights) != len(values):
         raise ArgumentError(f"weights={weights}: must be one for each of {len(values)} values")
@@ -313,14 +305,14 @@ def weighted_law(line: Bins, values: Annotated[list[Any], Len(1)], weights: list
 def normal_law(
     line: Bins, distribution: Literal["norm"], loc: float = 0.0, scale: Positive = 1.0
 ) -> Law:
-    """Returns a normal distribution on a continuous range, cut off at its ends.
+    """Returns a normal distribution on a continuous range, with its tails at the ends.
 
     Raises:
-        ArgumentError: of choices or whole numbers.
+        ArgumentError: for choices or whole numbers.
     """
     if not line.wide or not line.low.is_floating_point():
         raise ArgumentError(
-            f"distribution={distribution}: of a continuous range only; weigh values instead"
+            f"distribution={distribution}: of a continuous range only; use values and weights"
         )
 
     def quantile(shares: Tensor) -> Tensor:
@@ -336,43 +328,39 @@ def normal_law(
 def spaces(
     parameters: Mapping[str, RangeSettings], **seeds: Any
 ) -> tuple[ParameterSpace, ParameterSpace]:
-    """Returns the space of some parameters by name, and their target.
+    """Returns the space of some parameters and the distribution of their targets.
 
     Args:
         parameters: by name.
-        seeds: as of :class:`~proposer_rl.tasks.parameters.ParameterSpace`.
+        seeds: as in :class:`~proposer_rl.tasks.parameters.ParameterSpace`.
 
     Raises:
-        ValueError: naming the key, for a name or a value that is not allowed.
+        ArgumentError: naming the key, for a name or a value that is not allowed.
     """
     bins, target = {}, {}
     for name, given in parameters.items():
-        try:
+        with within(f"parameters.{name}", ValueError):
             if name in RESERVED or name.startswith("loss_"):
                 raise ValueError("is a column of training.csv; choose another name")
-            if not re.fullmatch(r"\w[\w .-]*", name):
-                raise ValueError("must be a name of letters, digits, spaces, dots and dashes")
             bins[name], target[name] = given.space_bins(), given.target_bins()
-        except ValueError as error:
-            raise ValueError(f"parameters.{name}: {error}") from error
-        if inside(target[name], bins[name]) < 0.5:  # a typing error, or extrapolation
+        if inside(target[name], bins[name]) < 0.5:  # by mistake, or to extrapolate
             warnings.warn(
                 f"parameters.{name}: most of the target, {target[name]}, lies outside of "
-                f"low={given.low:g} to high={given.high:g}, which training levels come from",
+                f"low={given.low:g} to high={given.high:g}, from which training levels are drawn",
                 stacklevel=2,
             )
     return ParameterSpace(bins, **seeds), ParameterSpace(target, **seeds)
 
 
 def inside(target: Bins, space: Bins) -> float:
-    """Returns how much of a target lies within the ends of a space."""
+    """Returns the share of a target that lies within the ends of a space."""
     low, high = space.low[:1].double(), space.high[-1:].double()
     below = torch.nextafter(low, low - 1)
     return float(target.below(high) - target.below(below))
 
 
 def python_values(given: Any) -> Any:
-    """Returns what is said of a parameter as Python's own; objects to choose from stay."""
+    """Returns a parameter's description in Python's own types; objects among choices stay."""
     if isinstance(given, list | tuple):
         own = [plain(value) if getattr(value, "ndim", None) == 0 else value for value in given]
         return tuple(own) if isinstance(given, tuple) else own
@@ -380,15 +368,15 @@ def python_values(given: Any) -> Any:
 
 
 def is_real(value: Any) -> bool:
-    """Returns whether a value is a number, which a truth value is not."""
+    """Returns whether a value is a number and not a truth value."""
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def value_text(value: Any, digits: int = 6) -> str:
-    """Returns a value of a parameter as it is shown: a number in so many digits, else a text."""
+    """Returns a value of a parameter as a text, a number in so many digits."""
     return f"{value:.{digits}g}" if is_real(value) else str(value)
 
 
 def _text(value: Any) -> str:
-    """Returns a value with all of its digits, as states are compared by it."""
+    """Returns a value with all of its digits, by which states are compared."""
     return str(value).removesuffix(".0") if is_real(value) else str(value)

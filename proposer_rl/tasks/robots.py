@@ -1,4 +1,4 @@
-"""Robots that walk up and down terrains with steps: thousands at once, on torch alone."""
+"""Robots that walk over terrains with steps, thousands at once, in torch alone."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from proposer_rl.tasks.batched_envs import BatchedEnv, Step, Values
 
 DT = 0.1  # seconds of a step
 APART = 1.0  # metres between two edges of the terrain
-HIGHEST = 0.5  # that a foot gets
-TILTED = 0.5  # from which a robot falls
-FAR = 0.8  # of the way that was commanded, which has to be walked
+HIGHEST = 0.5  # of a foot
+TILTED = 0.5  # lean beyond which a robot falls
+FAR = 0.8  # share of the commanded way that is a success
 
 
 class RobotEnv(BatchedEnv):
     """A body that leans over, with a foot that has to be lifted over every edge of the terrain.
 
-    A level's ``step`` is the height of the edges, ``slope`` that of the ground between them, and
-    ``speed`` is commanded. The three actions push forward, lift the foot, and turn the body, which
-    is unstable. A lifted foot pushes less. A foot that is too low at an edge stops the robot and
-    makes it stumble. Every step returns how near the speed is to what is commanded, at most 1 in an
-    episode; it ends where the body falls. Success is to stand at the end and to have walked most of
-    the way.
+    A level's ``step`` is the height of the edges, ``slope`` the slope of the ground between them,
+    and ``speed`` the commanded speed. The three actions push forward, lift the foot, and turn the
+    body, which is unstable. A lifted foot pushes less. A foot that is too low at an edge stops the
+    robot and makes it stumble. The reward of a step grows with the closeness of the speed to the
+    commanded one, to at most 1 in an episode, which ends when the body falls. A success is to stand
+    at the end after most of the way.
     """
 
     state_size = 5
@@ -31,14 +31,14 @@ class RobotEnv(BatchedEnv):
     draws = 3
 
     def begin(self, level: Values, chance: Tensor) -> Tensor:
-        """Returns the initial state [*B, 5], near rest: place, speed, foot, lean and its speed."""
+        """Returns first states [*B, 5], near rest: place, speed, foot, lean and its speed."""
         place, lean, turning = chance.unbind(-1)
         none = torch.zeros_like(place)
         state = [0.5 * APART * place, none, none, 0.1 * lean - 0.05, 0.1 * turning - 0.05]
         return torch.stack(state, -1)
 
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
-        """Returns the step's result: the robot's state after a step of Euler's method."""
+        """Returns the result of a step of Euler's method."""
         place, speed, foot, lean, turning = state.unbind(-1)
         push, lift, turn = action.unbind(-1)
         foot = (foot + 0.15 * lift).clamp(0, HIGHEST)
@@ -60,7 +60,7 @@ class RobotEnv(BatchedEnv):
         return Step(state, reward, fell, far & ~fell)
 
     def observe(self, state: Tensor, level: Values) -> Tensor:
-        """Returns what a robot feels and sees, each about -1 to 1."""
+        """Returns observations of body and ground, each about -1 to 1."""
         place, speed, foot, lean, turning = state.unbind(-1)
         ahead = 1 - (place / APART).frac()
         body = [speed - 1, 4 * foot - 1, lean / TILTED, turning, 2 * ahead - 1]

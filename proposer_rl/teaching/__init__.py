@@ -1,4 +1,4 @@
-"""Curricula in loops of one's own: a teacher, spaces of levels, TorchRL, Gymnasium, data sets."""
+"""Curricula in your own training loop: teachers, spaces of levels, and wrappers of libraries."""
 
 from proposer_rl.tasks.ranges import Log as Log
 from proposer_rl.teaching.gymnasium import TaughtEnv as TaughtEnv
@@ -10,7 +10,7 @@ from proposer_rl.teaching.sampler import mixed_groups as mixed_groups
 from proposer_rl.teaching.spaces import Items as Items
 from proposer_rl.teaching.spaces import LevelGenerator as LevelGenerator
 from proposer_rl.teaching.spaces import LevelSpace as LevelSpace
+from proposer_rl.teaching.spaces import MadeLevels as MadeLevels
 from proposer_rl.teaching.spaces import Parameters as Parameters
-from proposer_rl.teaching.structured import MadeLevels as MadeLevels
 from proposer_rl.teaching.teacher import Teacher as Teacher
 from proposer_rl.teaching.torchrl import LevelTransform as LevelTransform

@@ -10,46 +10,44 @@ import gymnasium
 import numpy as np
 from torch import Tensor
 
-from proposer_rl.settings import ArgumentError
-from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError, as_number, entries, stepped
-from proposer_rl.tasks.gymnasium.attributes import AttributeRefusedError, mismatch, write_attribute
+from proposer_rl.settings import ArgumentError, within
+from proposer_rl.tasks.gymnasium.environment import entries, mismatch, write_attribute
 from proposer_rl.tasks.parameters import SEED
 from proposer_rl.teaching.remote import TeacherClient
 from proposer_rl.teaching.teacher import Teacher
 
-SUCCESS = ("success", "is_success")  # entries of an info that mean it
+SUCCESS = ("success", "is_success")  # entries of an info that say it, if no rule is given
 
 
 class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An environment that asks a teacher for a level at every reset, and reports every episode.
+    """Asks a teacher for a level at every reset, and tells it the result of every episode.
 
     ``info`` has the ``level`` and its ticket ``level_id`` after a reset and after the last step.
-    Wrappers that end episodes, as ``TimeLimit``, belong inside: an episode that a reset cuts off
-    counts for nothing, of which the second warns. In vector environments every environment has its
-    wrapper, and all of them the same teacher, in other processes its client. An environment has one
-    ``TaughtEnv``: a second one around it is refused, and one that is put around what is inside
-    takes the place of the first.
+    Put wrappers that end episodes, such as ``TimeLimit``, inside: an episode that a reset cuts off
+    is dropped, and the second one is warned of. In a vector environment, wrap every environment
+    with the same teacher, or in other processes with its client. An environment has one
+    ``TaughtEnv``: a second one around it is refused, and a new one around its inner environment
+    replaces the first.
 
     Args:
         env: the environment.
-        teacher: in another process than its own, its client.
-        set: how a level gets into the environment before its reset: attributes of the unwrapped
-            environment by the parameters' names, as in ``{"gravity": "model.opt.gravity.2"}``; or a
-            function of the unwrapped environment and the level; or ``"options"`` for those of the
-            reset. A level's ``seed`` is that of the reset.
-        success: whether an episode was one: ``"terminated"``, ``"truncated"``, another entry of the
-            last info (``"metrics.won"`` is an entry of an entry), or a function of that; None for
-            its entry ``success`` or ``is_success``.
-        once: whether it may be one in any step, so that what is reached and lost again counts.
-        reset_truncates: whether a reset truncates an episode that has begun, which then counts, as
-            where wrappers outside end episodes.
+        teacher: the teacher, or in another process its client.
+        set: how a level gets into the environment before its reset: paths of attributes of the
+            unwrapped environment by parameter, as in ``{"gravity": "model.opt.gravity.2"}``; a
+            function of the unwrapped environment and the level; or ``"options"``, to pass the level
+            on as the reset's options. A level's ``seed`` becomes that of the reset.
+        success: whether an episode was a success: ``"terminated"``, ``"truncated"``, another entry
+            of the last info (``"metrics.won"`` for an entry of an entry), or a function of the last
+            info; None for the entry ``success`` or ``is_success``.
+        once: whether an episode is a success if any of its steps was, not only the last.
+        reset_truncates: whether a reset truncates an episode that has begun, which then counts;
+            needed where wrappers outside end episodes.
 
     Raises:
-        ArgumentError: if the environment has a ``TaughtEnv``, or the curriculum reads rollouts; at
-            a reset, if the environment has no such attribute, more than a number there, or another
-            value afterwards; in a step, if it returns something else than Gymnasium's interface
-            says; at the first end, if the curriculum reads success and nothing says it; later, if
-            another ``TaughtEnv`` has taken this one's place.
+        ArgumentError: if the environment has a ``TaughtEnv``; at a reset, if an attribute is
+            missing, not a single number, or has another value afterwards; at the end of an episode,
+            if nothing says whether it was a success but a rule was given or the curriculum requires
+            it; later, if another ``TaughtEnv`` has replaced this one.
     """
 
     def __init__(
@@ -66,22 +64,18 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         while isinstance(inner, gymnasium.Wrapper):
             if isinstance(inner, TaughtEnv):
                 raise ArgumentError(
-                    "env: has a TaughtEnv already, as where a cell is run twice: each would set a "
-                    "level of its own; make the environment anew, or give env.unwrapped"
+                    "env: has a TaughtEnv already, as happens when a cell is run twice; make the "
+                    "environment anew, or wrap env.unwrapped"
                 )
             inner = inner.env
         super().__init__(env)
-        if "rollout" in teacher.required_results:
-            raise ArgumentError("teacher: its curriculum reads rollouts, which this does not give")
-        if isinstance(set, str) and set != "options":
-            raise ArgumentError(f"set={set!r}: must be attributes, a function or 'options'")
-        # By which an environment knows its teacher, and a copy of it that of the copy.
+        # The environment knows its wrapper by this list; a deep copy of both has its own.
         self._own = self.unwrapped._taught = [id(self)]  # type: ignore[attr-defined]
         self._teacher, self._how, self._rule = teacher, set, success
         self._once, self._reset_truncates = once, reset_truncates
         self._ticket: int | None = None
         self._began = False  # any episode
-        self._cut_off = 0  # episodes
+        self._cut_off = 0  # number of episodes
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -94,7 +88,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._succeeded: float | None = None
         if callable(self._how):
             self._how(self.env.unwrapped, self._level)
-        elif isinstance(self._how, str):
+        elif self._how == "options":
             options = {**(options or {}), **self._level}
         else:
             self._set(self._how)
@@ -110,16 +104,12 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
                     )
         return observation, self._marked(info)
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Makes a step; after the last one of an episode the teacher gets return and success."""
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Makes a step; after the last one of an episode, tells the teacher its result."""
         self._require_own()
-        try:
-            answer = stepped(self.env.step(action))
-        except UnfitEnvironmentError as error:
-            raise ArgumentError(f"env: {error}") from error
-        observation, reward, terminated, truncated, info = answer
+        observation, reward, terminated, truncated, info = self.env.step(action)
         if self._ticket is not None:
-            self._return += reward
+            self._return += float(reward)
             self._steps += 1
             over = terminated or truncated
             if over:
@@ -128,29 +118,29 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             if over:
                 self._end()
             elif self._once:
-                self._note(self._success())
+                self._note_success()
         return observation, reward, terminated, truncated, info
 
     def _require_own(self) -> None:
         if self.unwrapped._taught is not self._own:  # type: ignore[attr-defined]
-            raise ArgumentError("env: another TaughtEnv has been put around it since; use that")
+            raise ArgumentError("env: another TaughtEnv was put around it since; use that one")
 
     def _end(self) -> None:
-        """Reports the episode to the teacher."""
-        self._note(self._success())
+        """Tells the teacher the result of the episode."""
+        self._note_success()
         needed = self._rule is not None or "success" in self._teacher.required_results
         if self._succeeded is None and needed:
             own = {name: self._last[name] for name in self._last.keys() - {"level", "level_id"}}
-            known = "gives None of the last info", "the last info has no such entry"
             raise ArgumentError(
-                f"success={self._rule!r}: {known[not callable(self._rule)]}; give one that it has, "
-                f"{', '.join(sorted(name for name, _ in entries(own)))}, or a function"
+                f"success={self._rule!r}: the last info of an episode does not have it, or the "
+                f"function returned None; give a function or one of its entries: "
+                f"{', '.join(sorted(name for name, _ in entries(own)))}"
             )
         self._teacher.tell(self._ticket, self._return, self._succeeded, steps=self._steps)
         self._ticket = None
 
     def _drop(self) -> None:
-        """Drops the episode that is played, if there is one."""
+        """Drops the episode that is being played, if there is one."""
         if self._ticket is None:
             return
         if self._steps and self._reset_truncates:
@@ -158,28 +148,26 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             self._end()
             return
         self._cut_off += bool(self._steps)
-        if self._steps and self._cut_off == 2:  # one alone may well be meant
+        if self._steps and self._cut_off == 2:  # a single one may well be intended
             warnings.warn(
-                "TaughtEnv: a second episode was cut off by a reset; such episodes count for "
-                "nothing. Put wrappers that end episodes inside, as in TaughtEnv(TimeLimit(env, "
-                "200), ...), or give reset_truncates=True",
+                "TaughtEnv: a second episode was cut off by a reset; such episodes are dropped. "
+                "Put wrappers that end episodes inside, as in TaughtEnv(TimeLimit(env, 200), ...), "
+                "or give reset_truncates=True",
                 stacklevel=3,
             )
         self._teacher.drop(self._ticket)
 
-    def _set(self, how: Mapping[str, str]) -> None:
+    def _set(self, how: Any) -> None:
         """Sets attributes of the environment to the values of the level."""
-        names = [*self._level.keys()] if isinstance(self._level, Mapping) else []
         for name, path in how.items():
-            try:
+            with within(f"set.{name}={path!r}", ValueError):
                 write_attribute(self.env.unwrapped, path, _plain(self._level[name]))
-            except AttributeRefusedError as error:
-                raise ArgumentError(f"set.{name}={path!r}: {error}") from error
+        names = self._level.keys() if isinstance(self._level, Mapping) else ()
         left_out = [name for name in names if name not in (*how, SEED)]
         if left_out and not self._began:
             warnings.warn(
-                f"set: leaves out {', '.join(left_out)}, which the environment then never gets: "
-                "the curriculum chooses among values that change nothing",
+                f"set: leaves out {', '.join(left_out)}, so that the curriculum chooses among "
+                "values that change nothing in the environment",
                 stacklevel=3,
             )
         self._began = True
@@ -187,22 +175,16 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _marked(self, info: Mapping[str, Any]) -> dict[str, Any]:
         return {**info, "level": self._level, "level_id": self._ticket}
 
-    def _success(self) -> Any:
-        """Returns what the last step says of success; None where it says nothing."""
-        rule = self._rule
-        if callable(rule):
-            return rule(self._last)
-        known = dict(entries(self._last))
-        return next((known[n] for n in ((rule,) if rule else SUCCESS) if n in known), None)
-
-    def _note(self, success: Any) -> None:
-        if success is None:
-            return
-        try:
-            now = as_number(success, f"success={self._rule!r}: what came of an episode")
-        except UnfitEnvironmentError as error:
-            raise ArgumentError(str(error)) from error
-        self._succeeded = max(now, self._succeeded or 0.0) if self._once else now
+    def _note_success(self) -> None:
+        """Notes what the last step says about success, if it says anything."""
+        if callable(self._rule):
+            success = self._rule(self._last)
+        else:
+            known, names = dict(entries(self._last)), (self._rule,) if self._rule else SUCCESS
+            success = next((known[name] for name in names if name in known), None)
+        if success is not None:
+            now = float(np.asarray(success).item())
+            self._succeeded = max(now, self._succeeded or 0.0) if self._once else now
 
 
 def _plain(value: Any) -> Any:

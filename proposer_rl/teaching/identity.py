@@ -1,4 +1,4 @@
-"""Describes what a teacher's state belongs to, and how two descriptions differ."""
+"""Describes what a teacher's state belongs to, and compares descriptions."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from proposer_rl.curricula.combinators import Combinator
 from proposer_rl.settings import ArgumentError
 from proposer_rl.task import Levels, level_inputs
 
-SHOWN = 3  # differences in one line
-LONGEST = 60  # of a value in it
+SHOWN = 3  # number of differences in an error
+LONGEST = 60  # number of letters of a value in it
 
 
 def of_levels(space: Any, like: Levels) -> dict[str, Any]:
-    """Describes a space or task, and its levels by one of them: numbers and texts for JSON."""
+    """Describes a space or task, and its levels by an example: numbers and texts for JSON."""
     entries = {
         ".".join([name] if isinstance(name, str) else name): like.get(name)
         for name in like.keys(True, True)
@@ -29,28 +29,28 @@ def of_levels(space: Any, like: Levels) -> dict[str, Any]:
 
 
 def of_classes(curriculum: Curriculum) -> str:
-    """Returns the name of a curriculum's class, and those of its parts."""
+    """Returns the names of the classes of a curriculum and its parts."""
     parts = curriculum.parts if isinstance(curriculum, Combinator) else []
     within = f"({', '.join(map(of_classes, parts))})" if parts else ""
     return type(curriculum).__qualname__ + within
 
 
 def require_same(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Refuses a state that belongs to another space, task or curriculum.
+    """Compares the description in a state with the present one.
 
     Raises:
-        ArgumentError: naming what differs.
+        ArgumentError: if they differ, naming what.
     """
     old, new = dict(_flat(before)), dict(_flat(now))
     if old.get("kind") != new.get("kind"):
         old, new = ({"kind": one.get("kind")} for one in (old, new))
     differ = [name for name in {**old, **new} if old.get(name, ...) != new.get(name, ...)]
-    # Entries of levels follow from the rest, where that is known.
+    # If anything else differs, it explains differences in the entries of levels.
     differ = [name for name in differ if not name.startswith("levels.")] or differ
     if differ:
         lines = [f"{name} was {_said(old, name)}, is {_said(new, name)}" for name in differ[:SHOWN]]
         more = f"; and {len(differ) - SHOWN} more" if len(differ) > SHOWN else ""
-        raise ArgumentError(f"state: of another {what}: {'; '.join(lines)}{more}")
+        raise ArgumentError(f"state: belongs to another {what}: {'; '.join(lines)}{more}")
 
 
 def _flat(description: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -1,17 +1,23 @@
-"""A curriculum by name for a space of levels, without a run."""
+"""Makes a teacher's curriculum, and adapts the functions that it may call."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import torch
+from tensordict import TensorDict, TensorDictBase
+
 from proposer_rl.curricula import Curriculum, LearnedCurriculum
+from proposer_rl.curricula.batches import moved
 from proposer_rl.meta.assembly import Components, ProposerSettings
 from proposer_rl.methods import around, asked, build, completed
 from proposer_rl.recipes import Recipe, as_recipe
 from proposer_rl.settings import ArgumentError, plain, shown
 from proposer_rl.teaching.identity import of_classes
+
+OF_LEVELS = ("optimal_return", "exact_performance", "performance", "play")
 
 
 def make_curriculum(
@@ -20,12 +26,15 @@ def make_curriculum(
     filter: Mapping[str, Any] | str | None,
     seed: int,
 ) -> tuple[Curriculum, dict[str, Any]]:
-    """Returns the curriculum on the levels of a space or task; by name, with its file's filter.
+    """Makes a curriculum on the levels of a space or task, with its filter.
 
     Returns:
-        The curriculum; its name or class and all its settings, for JSON.
+        The curriculum; and its name or class with all its settings, for JSON.
+
+    Raises:
+        ArgumentError: if the space is none, or the curriculum trains replicas of the learner.
     """
-    if isinstance(space, type) or not hasattr(space, "space"):
+    if not hasattr(space, "space"):
         raise ArgumentError(
             f"space={shown(space)}: must be Parameters, Items, LevelGenerator, MadeLevels or a task"
         )
@@ -42,12 +51,35 @@ def make_curriculum(
     if isinstance(made, LearnedCurriculum) and made.trains_replicas:
         raise ArgumentError(
             f"curriculum={type(made).__name__}: trains replicas of the learner; use "
-            "proposer_rl.train, or SolverTrainingEnv for learners of your own"
+            "proposer_rl.train, or SolverTrainingEnv with your own learner"
         )
     own = config.pop("curriculum", {})
     own.pop("_target_", None)
     described = json.dumps(plain({"kind": named, **own, **config}), default=_name)
     return made, json.loads(described)
+
+
+def adapted(name: str, function: Any, given: Callable[[Any], Any], device: torch.device) -> Any:
+    """Wraps a loop's function of levels [n], so that it gets levels as the loop does.
+
+    Args:
+        name: the function's name in :class:`~proposer_rl.curricula.Student`.
+        function: the loop's function.
+        given: converts levels for the loop.
+        device: the device on which the loop gets levels.
+    """
+    if name not in OF_LEVELS:
+        return function
+
+    def of_levels(levels: Any, *more: Any) -> Any:
+        draws = more if name == "play" else ()
+        found = function(given(moved(levels, device).clone()), *draws)  # it may change the copy
+        if isinstance(found, dict):
+            entries = {key: torch.as_tensor(entry).float() for key, entry in found.items()}
+            return TensorDict(entries, levels.shape[:1])
+        return found if isinstance(found, TensorDictBase) else torch.as_tensor(found)
+
+    return of_levels
 
 
 def _name(value: Any) -> str:

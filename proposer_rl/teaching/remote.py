@@ -1,4 +1,4 @@
-"""A teacher for other processes, whose clients are answered by threads of its own process."""
+"""Clients of a teacher in other processes, and the threads that answer them."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from typing import Any
 
 
 class TeacherClient:
-    """Stands for a teacher in another process; :meth:`Teacher.client` makes it, to be sent there.
+    """Calls a teacher that is in another process; :meth:`Teacher.client` makes one to send there.
 
-    The order in which several processes ask is not fixed, so that such runs do not repeat each
-    other.
+    The order in which several processes ask is not fixed, so such runs cannot be repeated exactly.
     """
 
     def __init__(self, address: Any, key: bytes, required_results: tuple[str, ...]) -> None:
@@ -26,15 +25,15 @@ class TeacherClient:
         self._lock = Lock()
 
     def ask(self, n: int | None = None) -> tuple[Any, Any]:
-        """Returns the next levels and their tickets, see :meth:`Teacher.ask`."""
+        """Returns the next levels and their tickets, as :meth:`Teacher.ask` does."""
         return self._call("ask", n)
 
     def tell(self, ids: Any, return_: Any, success: Any = None, **more: Any) -> None:
-        """Reports the results of levels, see :meth:`Teacher.tell`."""
+        """Takes the results of levels, as :meth:`Teacher.tell` does."""
         self._call("tell", ids, return_, success, **more)
 
     def drop(self, ids: Any = None) -> None:
-        """Gives up levels, see :meth:`Teacher.drop`."""
+        """Gives up levels, as :meth:`Teacher.drop` does."""
         self._call("drop", ids)
 
     def __reduce__(self) -> Any:
@@ -48,7 +47,7 @@ class TeacherClient:
                     self._process = os.getpid()
                 self._connection.send_bytes(pickle.dumps((name, arguments, more)))
                 result, error = pickle.loads(self._connection.recv_bytes())
-            except (AuthenticationError, EOFError, OSError) as lost:  # or its place was taken
+            except (AuthenticationError, EOFError, OSError) as lost:
                 raise RuntimeError("the process of the teacher has ended") from lost
         if error is not None:
             raise error
@@ -56,13 +55,13 @@ class TeacherClient:
 
 
 class TeacherServer:
-    """Answers clients of a teacher from threads of this process."""
+    """Answers a teacher's clients, from threads of this process."""
 
     def __init__(self, teacher: Any) -> None:
         self._teacher, self._key = teacher, os.urandom(32)
         try:
             self._listener = Listener(authkey=self._key)
-        except OSError:  # a socket's path below a long TMPDIR
+        except OSError:  # as where TMPDIR is too long for a socket's path
             self._listener = Listener(("127.0.0.1", 0), authkey=self._key)
         Thread(target=self._accept, daemon=True).start()
 
@@ -72,7 +71,7 @@ class TeacherServer:
 
     def _accept(self) -> None:
         while True:
-            with suppress(EOFError, OSError):  # the client has left, or has another key
+            with suppress(EOFError, OSError):  # of a client that has left or has another key
                 connection = self._listener.accept()
                 Thread(target=self._answer, args=(connection,), daemon=True).start()
 
@@ -82,7 +81,7 @@ class TeacherServer:
                 name, arguments, more = pickle.loads(connection.recv_bytes())
                 answer: tuple[Any, Exception | None]
                 try:
-                    with self._teacher._here():  # what it computes in its caller's thread is over
+                    with self._teacher._here():  # waits for calls of other threads
                         answer = getattr(self._teacher, name)(*arguments, **more), None
                 except Exception as error:
                     answer = None, error

@@ -1,4 +1,4 @@
-"""Turns a loop's results, numbers or rollouts, into outcomes that curricula observe."""
+"""Turns a training loop's results, numbers or rollouts, into outcomes for curricula."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from proposer_rl.teaching.numbers import as_numbers
 
 RESULTS = ("return", "success", "score", "episodes", "steps")
 COUNTS = ("episodes", "steps")
-MOST = 1e15  # of these, which float64 still counts one by one
+MOST = 1e15  # up to which float64 holds every whole number
 BOUNDS = {"success": (0, 1), "episodes": (1, MOST), "steps": (0, MOST)}
 LEVEL_ID = "level_id"
-MASK = ("collector", "mask")  # of the steps that are some, where trajectories were split
+MASK = ("collector", "mask")  # where split_trajectories marks real steps
 ENDS = ("done", "terminated", "truncated", "success")
 
 
 def as_outcome(results: Mapping[str, NDArray[np.float64]]) -> TensorDict:
     """Returns the outcome [m] that curricula observe, from results [m] by name.
 
-    NaN is a result that the loop did not give: a count is then 1; another result that is missing
-    for one level is left out for all.
+    NaN means that the loop gave no result: a count is then 1, and another result that one level
+    lacks is left out for all.
     """
     outcome = {}
     for name, result in results.items():
@@ -40,10 +40,10 @@ def as_outcome(results: Mapping[str, NDArray[np.float64]]) -> TensorDict:
 
 
 def by_name(outcome: Any) -> dict[str, Any]:
-    """Returns the results of an outcome, or its rollout alone where it has one.
+    """Returns the results of an outcome by name, or only its rollout if it has one.
 
     Raises:
-        ArgumentError: for a name that means nothing here.
+        ArgumentError: for an unknown name.
     """
     names = [*outcome.keys()]
     if "rollout" in names:
@@ -54,61 +54,57 @@ def by_name(outcome: Any) -> dict[str, Any]:
 
 
 def as_result(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Reads the results of a name, [n] or of one level; one count may stand for all.
+    """Checks results of a name, [n] or of a single level; one count may stand for all levels.
 
     Raises:
-        ArgumentError: naming the argument, see :func:`as_numbers`.
+        ArgumentError: as of :func:`~proposer_rl.teaching.numbers.as_numbers`.
     """
+    if name == "rollout":
+        return value
     given, counts = "return_" if name == "return" else name, name in COUNTS
     spread = shape == (1,) or (counts and shape != ())
     return as_numbers(given, value, shape, *BOUNDS.get(name, ()), whole=counts, spread=spread)
 
 
-def outcome_of_rollout(rollout: TensorDictBase, rule: Any) -> TensorDict:
-    """Returns the outcome [n] of a rollout [n, T], without success where nothing says it.
+def results_of_rollout(rollout: TensorDictBase, rule: Any) -> dict[str, Any]:
+    """Returns return, rollout and perhaps success of each row of a rollout [n, T].
 
     Args:
         rollout: with ``success`` in its ``next``, or without.
-        rule: an entry or a function of ``next`` that then says it; None for none.
+        rule: an entry or a function of ``next`` that gives the success if there is no such entry;
+            None for none.
     """
     rollout, after = rollout.copy(), rollout["next"].copy()
     if "success" not in after.keys() and rule is not None:
         after["success"] = rule(after) if callable(rule) else after[rule]
     rollout["next"] = after
     outcome = outcome_of(rollout)
-    return outcome if "success" in after.keys() else outcome.exclude("success")
+    rows = np.empty(len(rollout), object)
+    rows[:] = outcome["rollout"].unbind(0)
+    names = ("return", "success") if "success" in after.keys() else ("return",)
+    return {**{name: outcome[name] for name in names}, "rollout": rows}
 
 
 def ended(
     rollout: TensorDictBase, kept: TensorDictBase | None = None
 ) -> tuple[NDArray[np.int64], TensorDictBase, TensorDictBase]:
-    """Returns the episodes that end in a rollout, and the steps of those that do not.
+    """Returns the episodes that end in a rollout, and the steps of the other episodes.
 
     Args:
-        rollout: [*B, T] with ``level_id``, a number for each level that was begun, by which
-            parts of an episode find each other, in whichever rows they are.
-        kept: steps [L] of episodes that had not ended in the rollouts before it; None before the
-            first.
+        rollout: [*B, T] with ``level_id``, the ticket of each step's level, by which the parts of
+            an episode are put together from whichever rows they are in.
+        kept: steps [L] of episodes that had not ended in earlier rollouts; None before the first.
 
     Returns:
-        Their levels' numbers [m]; a rollout [m, L] of whole episodes, in which what is behind
-        the end of each is no step, as ``is_step`` says: it has no reward and no end; and what is to
-        be kept for the next rollout.
-
-    Raises:
-        ArgumentError: if it does not say which levels it is of.
+        The tickets [m] of the episodes that end; a rollout [m, L] of these, padded with steps that
+        have no reward and no end, and where ``is_step`` is false; and the steps to keep for the
+        next rollout.
     """
-    if LEVEL_ID not in rollout.keys():
-        raise ArgumentError(
-            "rollout: has no level_id, so that nothing shows on which levels its episodes "
-            "began; put LevelTransform around the environment, or give outcome_of(rollout) "
-            "where each row begins with a reset on its level"
-        )
-    steps: Any = rollout.contiguous().flatten()  # also where it is stacked lazily
-    if MASK in rollout.keys(True):  # rows are filled up to one length
+    steps: Any = rollout.contiguous().flatten()  # contiguous, as it may be stacked lazily
+    if MASK in rollout.keys(True):  # rows are padded to one length
         steps = steps[rollout[MASK].reshape(-1)]
     if kept is not None:
-        # A checkpoint's tensors are on the CPU.
+        # Loaded from a checkpoint, they are on the CPU.
         steps = torch.cat([kept.to(steps[LEVEL_ID].device), steps])
     ids, done = (entry.reshape(-1) for entry in (steps[LEVEL_ID], steps["next", "done"]))
     order = ids.argsort(stable=True)

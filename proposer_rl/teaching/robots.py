@@ -1,4 +1,4 @@
-"""A teacher's levels in curriculum managers of Isaac Lab and mjlab, and in rsl_rl's checkpoints."""
+"""Levels of a teacher in Isaac Lab's and mjlab's curriculum managers, kept by rsl_rl."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ NONE = -1  # the ticket of no level
 
 
 class LevelTerm:
-    """A term of a curriculum manager: asks a teacher for the levels of environments that reset.
+    """Asks a teacher for the levels of environments that reset, as a curriculum manager's term.
 
-    Subclass it, and for Isaac Lab also ``ManagerTermBase``, to say what levels there are, how an
-    episode went and how an environment plays a level; then name the class in the config:
+    Subclass it, and for Isaac Lab also ``ManagerTermBase``, to define the levels, the result of an
+    episode and how an environment plays a level; then name the class in the config:
 
         class Terrain(prl.LevelTerm, ManagerTermBase):
             def make_teacher(self): return prl.Teacher("adr", space, device=self.env.device)
@@ -30,24 +30,23 @@ class LevelTerm:
 
         cfg.curriculum["terrain"] = CurriculumTermCfg(func=Terrain)
 
-    Results count of episodes that ended by themselves and were played from their first step. Two
-    kinds are dropped: episodes that another reset cuts off, and those whose length the runner has
-    changed on the way, as ``learn(init_at_random_ep_len=True)`` does with the first of each
-    environment. These are dropped however they end: of those that are cut short, only failures
-    would be left to count.
+    Only the results of whole episodes are told. Two kinds are dropped: episodes that another reset
+    cuts off, and episodes whose length counter the runner changed, as
+    ``learn(init_at_random_ep_len=True)`` does with the first of each environment: they are cut
+    short, so that nearly all that ended by themselves would be failures.
 
-    In a launch of several processes each draws levels of its own (``RANK`` says which it is). The
-    manager logs the mean of each parameter over the levels that are played.
+    In a launch of several processes each draws levels of its own, by its ``RANK``. The manager logs
+    the mean of each parameter over the levels that are played.
 
     Args:
-        cfg: of the term.
-        env: with ``num_envs``, ``device``, ``common_step_counter``, ``episode_length_buf`` and,
-            from the first step on, ``reset_buf``, bool [num_envs]. The term adds itself to the
-            environment's list ``taught``, which :class:`TaughtRunner` reads.
+        cfg: the term's config.
+        env: an environment with ``num_envs``, ``device``, ``common_step_counter``,
+            ``episode_length_buf`` and, after the first step, ``reset_buf``, bool [num_envs]. The
+            term adds itself to its list ``taught``, which :class:`TaughtRunner` reads.
 
     Attributes:
-        env, teacher: as given and made.
-        tickets: of the levels that are played, int64 [num_envs].
+        env, teacher: the environment and the teacher.
+        tickets: tickets of the levels that are played, int64 [num_envs].
     """
 
     def __init__(self, cfg: Any, env: Any) -> None:
@@ -55,34 +54,34 @@ class LevelTerm:
         self.teacher = self.make_teacher()
         self.teacher.diverge(_rank())
         self.tickets = torch.full((env.num_envs,), NONE, device=env.device)
-        self._begun = torch.zeros_like(self.tickets)  # common_step_counter when they were asked for
+        self._begun = torch.zeros_like(self.tickets)  # common_step_counter at their reset
         self._levels: Any = None
         env.taught = [*getattr(env, "taught", ()), self]
 
     @abstractmethod
     def make_teacher(self) -> Teacher:
-        """Returns the teacher, of one student."""
+        """Returns the teacher."""
 
     @abstractmethod
     def results(self, env_ids: Tensor) -> tuple[Any, Any]:
         """Returns return and success of the episodes that have ended, [n] each.
 
-        Success may be None, where the curriculum reads none.
+        Success may be None for curricula that do not use it.
         """
 
     @abstractmethod
     def set_levels(self, env_ids: Tensor, levels: Any) -> None:
-        """Makes environments int64 [n] play levels [n] from this reset on."""
+        """Makes environments int64 [n] play levels [n], from this reset on."""
 
     def reset(self, env_ids: Any = None) -> None:
-        """Does nothing: a manager calls it after the term itself."""
+        """Does nothing; the manager calls it after the term itself."""
 
     def __call__(self, env: Any, env_ids: Any) -> dict[str, Tensor]:
-        """Tells the teacher how episodes went, and sets the next levels of their environments.
+        """Tells the teacher the results of episodes, and sets the environments' next levels.
 
         Args:
             env: the environment.
-            env_ids: numbers, a mask or a slice; None for all.
+            env_ids: numbers, a mask or a slice; None for all environments.
         """
         ids = torch.arange(env.num_envs, device=env.device)[env_ids].reshape(-1)
         tickets, steps = self.tickets[ids], env.common_step_counter - self._begun[ids]
@@ -110,26 +109,26 @@ class LevelTerm:
         return self.teacher.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Loads a teacher's state; results of the levels that are played now do not count.
+        """Loads a teacher's state, and drops the levels that are played now.
 
-        Only one process saves, and all load what it saved: each goes on with draws of its own.
+        All processes load what one of them saved, and go on with draws of their own.
         """
         self.teacher.drop()
         self.tickets.fill_(NONE)
         self.teacher.load_state_dict(state)
-        self.teacher.drop()  # what the environments that saved it played
+        self.teacher.drop()  # the levels that the environments of the saved state played
         self.teacher.diverge(_rank())
 
 
 class TaughtRunner:
-    """Keeps the teachers of an environment's :class:`LevelTerm` in the checkpoints of ``rsl_rl``.
+    """Saves the teachers of an environment's :class:`LevelTerm` in ``rsl_rl``'s checkpoints.
 
-    Name it before the runner, of ``rsl_rl`` or mjlab:
+    Make it the first base class, before a runner of ``rsl_rl`` or mjlab:
 
         class Runner(prl.TaughtRunner, OnPolicyRunner): ...
 
     Raises:
-        ArgumentError: if it is named after the runner, whose checkpoints would have no teacher.
+        ArgumentError: if it comes after the runner, whose checkpoints would have no teacher.
     """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -145,18 +144,18 @@ class TaughtRunner:
         return terms
 
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
-        """Saves a checkpoint, whose ``infos`` have the teachers' states as ``teachers``."""
+        """Saves a checkpoint, with the teachers' states in ``infos`` as ``teachers``."""
         parent: Any = super()
         teachers = [term.state_dict() for term in self._terms]
         parent.save(path, {**(infos or {}), "teachers": teachers})
 
     def load(self, path: str, *args: Any, **kwargs: Any) -> Any:
-        """Loads one, and returns its ``infos``.
+        """Loads a checkpoint, and returns its ``infos``.
 
         An environment without a term, in which a policy only plays, needs no teacher.
 
         Raises:
-            ArgumentError: if the checkpoint has not one teacher for each term.
+            ArgumentError: if the checkpoint has fewer or more teachers than there are terms.
         """
         parent: Any = super()
         infos = parent.load(path, *args, **kwargs)

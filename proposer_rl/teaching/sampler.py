@@ -1,4 +1,4 @@
-"""Curricula over data sets: a sampler of items whose results come back later."""
+"""Curricula over data sets: a sampler of items, to which results are told later."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from torch import Tensor, distributed
 from torch.utils.data import Sampler
 
 from proposer_rl.settings import ArgumentError, Count, checked
+from proposer_rl.teaching.identity import require_same
 from proposer_rl.teaching.numbers import as_ids, as_numbers
 from proposer_rl.teaching.results import MOST
-from proposer_rl.teaching.spaces import Items
 from proposer_rl.teaching.teacher import Teacher
 
 T = TypeVar("T")
 
-FEW = 32  # items of which it is too early to say that most are missing
+FEW = 32  # items, before which it is too early to say that most results are missing
 
 
 class Answer(NamedTuple):
-    """The result of an item: success and return of an answer, or the means of several."""
+    """Success and return of an answer to an item, or the means of several answers."""
 
     success: float
     return_: float
@@ -36,36 +36,33 @@ class Answer(NamedTuple):
 
 @dataclass
 class Epoch:
-    """The items drawn in an epoch, and how many were given to the loop, with repetitions."""
+    """The items drawn in an epoch, and the number given to the loop, with repetitions."""
 
     drawn: list[int] = field(default_factory=list)
     place: int = 0
 
 
 class TeacherSampler(Sampler[int]):
-    """Samples items that a teacher proposes, for any loader; results are reported by item.
+    """Samples the items that a teacher proposes, for any loader, and takes results by item.
 
-    Each item is out until ``repeat`` answers to it have come back, in any order and over any number
-    of calls; the teacher gets their means.
+    An item is out until ``repeat`` answers to it were told, in any order and over any number of
+    calls; the teacher gets their means.
 
-    In a launch of several ranks every rank makes the same teacher and the same sampler, draws from
-    it in step with the others, and reports the results of its own part. :meth:`tell` and
-    :meth:`drop` gather those of all ranks, where ``torch.distributed`` is initialized, so that all
-    teachers stay the same.
+    In a launch of several ranks, make the same teacher and the same sampler on every rank, draw
+    from it in step, and tell the results of the rank's own part. :meth:`tell` and :meth:`drop`
+    gather those of all ranks where ``torch.distributed`` is initialized, so that all teachers stay
+    the same.
 
-    Importing TorchRL makes processes spawn: a script whose loader has workers needs its
+    Importing TorchRL makes processes spawn: a script whose loader has workers needs
     ``if __name__ == "__main__":``.
 
     Args:
-        teacher: of :class:`Items`.
-        length: items of an epoch.
-        repeat: how many times each comes, one after another, as groups of answers to one prompt.
-        group: items that are repeated together before they come again; with ``rounds``.
-        rounds: how many times each group comes over again.
-        sources: where each item is from, [N], by which :meth:`metrics` are given, too.
-
-    Raises:
-        ArgumentError: if the teacher's levels are no items, or not each has a source.
+        teacher: a teacher of :class:`Items`.
+        length: number of items of an epoch.
+        repeat: number of times that each item comes in a row, as in groups of answers to a prompt.
+        group: number of items after which a round ends, if there are several ``rounds``.
+        rounds: number of times that each group comes.
+        sources: the source of each item, [N], by which :meth:`metrics` are also given.
     """
 
     @checked
@@ -79,19 +76,16 @@ class TeacherSampler(Sampler[int]):
         rounds: Count = 1,
         sources: Any = None,
     ) -> None:
-        count = items_of(teacher).size
-        if sources is not None and len(sources) != count:
-            raise ArgumentError(f"sources: {len(sources)} for {count} items")
         self._teacher, self._length = teacher, length
         self._repeat, self._group, self._rounds = repeat, group, rounds
         self._out: dict[int, list[int]] = defaultdict(list)  # tickets of each item
-        # Answers to items of which more are to come.
+        # Answers to items for which more are to come.
         self._came: dict[int, list[Answer | None]] = {}
-        self._epoch, self._goes_on = Epoch(), False  # whether the next one is the rest of it
-        self._asked, self._trace = 0, 0  # how many items since the start, and a checksum of them
-        self._check: float = 0  # how many there must be for the next look at what is missing
+        self._epoch, self._goes_on = Epoch(), False  # whether the next epoch is the rest of it
+        self._asked, self._trace = 0, 0  # number of items since the start, and their checksum
+        self._check: float = 0  # number of items at which to look for missing results again
         self._sources = sources
-        self._sums: dict[str, list[float]] = {}  # since the last metrics, of all and by source
+        self._sums: dict[str, list[float]] = {}  # since the last metrics(), in all and by source
 
     def __len__(self) -> int:
         return self._length * self._repeat * self._rounds
@@ -112,35 +106,35 @@ class TeacherSampler(Sampler[int]):
             self._epoch = Epoch()
 
     def rewind(self) -> None:
-        """Gives the items of this epoch again from its first one, before any new ones.
+        """Restarts this epoch: its items come again from the first, before any new ones.
 
-        For loops that skip what they have had, as with accelerate's ``skip_first_batches``.
+        For loops that skip batches after a resume, as by accelerate's ``skip_first_batches``.
         """
         self._epoch.place, self._goes_on = 0, True
 
     def tell(
         self, items: Sequence[int], success: Any, return_: Any = None, *, episodes: Any = None
     ) -> None:
-        """Reports results of items; each counts when its last answer is there.
+        """Takes results of items; an item counts once its last answer was told.
 
         Args:
-            items: as they were drawn, with their repetitions, in any order, [n].
-            success: of each answer, from 0 to 1; None for one of which nothing came, [n].
-            return_: of each; None for the success.
-            episodes: how many answers each is the mean of, where ``repeat`` is 1; None for one.
+            items: items as they were drawn, with their repetitions, in any order, [n].
+            success: success of each answer, from 0 to 1; None for an answer without a result, [n].
+            return_: return of each answer; None for the success.
+            episodes: number of answers that each number is the mean of; None for 1.
 
         Raises:
-            ArgumentError: for an item of which not so many answers are out, or another number of
-                results; none of them counts then, on any rank.
+            ArgumentError: for an item that has fewer answers out, or another number of results; the
+                call then has no effect on any rank.
         """
         self._count(lambda: _answers(items, success, return_, episodes))
 
     def drop(self, items: Sequence[int] | None = None) -> None:
-        """Gives up items of which no results will come.
+        """Gives up items that will have no results.
 
         Args:
-            items: see :meth:`tell`; None for all that are out, where a resumed loop begins an
-                epoch anew.
+            items: as of :meth:`tell`; None for all that are out, as where a resumed loop begins a
+                new epoch.
         """
         if items is None:
             self._teacher.drop([*chain.from_iterable(self._out.values())])
@@ -151,12 +145,12 @@ class TeacherSampler(Sampler[int]):
             self._count(lambda: [(item, None) for item in as_ids("items", items).tolist()])
 
     def metrics(self) -> dict[str, float]:
-        """Returns means over the groups that were complete since the last call.
+        """Returns means over the groups that were completed since the last call.
 
-        ``success``; what the curriculum had ``predicted`` of it, if it has a belief; ``yield``, the
-        share of groups whose answers differ, of which a mean between 0 and 1 is taken for one;
-        ``no_variance``, that of all others; and the same by source, as ``yield/SOURCE``. Nothing
-        if there was no group.
+        ``success``; the success that the curriculum had ``predicted``, if it has a belief;
+        ``yield``, the share of groups whose answers differ, as they also do if an answer is a mean
+        between 0 and 1; ``no_variance``, the share of the others; and the same by source, as
+        ``yield/SOURCE``. Empty if there was no group.
         """
         shown: dict[str, float] = {}
         for of, (groups, success, mixed, predicted, known) in self._sums.items():
@@ -168,28 +162,26 @@ class TeacherSampler(Sampler[int]):
         return shown
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns what is out, and the place in the epoch; the teacher has a state of its own."""
+        """Returns what is out and the place in the epoch, without the teacher's state."""
         return {
             "groups": [self._repeat, self._group, self._rounds],
             "out": {item: list(tickets) for item, tickets in self._out.items() if tickets},
-            # torch.load(weights_only=True) takes tuples, none that have names.
+            # torch.load(weights_only=True) loads tuples, but no named ones.
             "came": {i: [one and tuple(one) for one in each] for i, each in self._came.items()},
             "drawn": list(self._epoch.drawn),
             "place": self._epoch.place,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back a state; the next epoch is the rest of the one that was begun.
+        """Loads a state; the next epoch is the rest of the one that had begun.
 
         Raises:
-            ArgumentError: if it is of other groups.
+            ArgumentError: if the state belongs to other groups.
         """
-        groups = [self._repeat, self._group, self._rounds]
-        if list(state["groups"]) != groups:
-            raise ArgumentError(
-                f"state: of [repeat, group, rounds] = {list(state['groups'])}, not {groups}"
-            )
-        self._out = defaultdict(list)  # JSON has made texts of the items
+        names = ("repeat", "group", "rounds")
+        groups = dict(zip(names, [self._repeat, self._group, self._rounds], strict=True))
+        require_same("sampler", dict(zip(names, state["groups"], strict=True)), groups)
+        self._out = defaultdict(list)  # whose items are texts if the state was stored as JSON
         self._out.update({int(item): list(tickets) for item, tickets in state["out"].items()})
         self._came = {
             int(item): [answer and Answer(*answer) for answer in answers]
@@ -208,7 +200,7 @@ class TeacherSampler(Sampler[int]):
         return int(item)
 
     def _forget(self) -> None:
-        """Forgets what the teacher has done with, as a loader's state may be older than its own."""
+        """Forgets tickets that are over, since a loader's state may be older than the teacher's."""
         for item, tickets in self._out.items():
             done = self._teacher.done_with(tickets)
             if done.any():
@@ -216,7 +208,7 @@ class TeacherSampler(Sampler[int]):
                 self._came.pop(item, None)
 
     def _count(self, read: Callable[[], list[tuple[int, Answer | None]]]) -> None:
-        """Counts answers, and gives the teacher the results of items whose last answer came."""
+        """Adds answers, and tells the teacher the results of items whose last answer came."""
         came: dict[int, list[Answer | None]] = {}
         for item, answer in _everywhere(read, self._trace):
             came.setdefault(item, list(self._came.get(item, ()))).append(answer)
@@ -227,8 +219,10 @@ class TeacherSampler(Sampler[int]):
         for item, answers in came.items():
             tickets = self._out.get(item, [])
             if len(answers) > len(tickets) * self._repeat:
-                often = f" {len(answers)} times" if tickets else ""
-                raise ArgumentError(f"items={item}: is not out{often}")
+                raise ArgumentError(
+                    f"items={item}: {len(answers)} answers, but only {len(tickets) * self._repeat} "
+                    "are out"
+                )
             full = len(answers) // self._repeat
             for ticket in tickets[:full]:
                 group, answers[:] = answers[: self._repeat], answers[self._repeat :]
@@ -269,7 +263,7 @@ class TeacherSampler(Sampler[int]):
                 sums[place] += value
 
     def _look(self) -> None:
-        """Warns, once, if results of most items never come, when few can still be on their way."""
+        """Warns once if results of most items never come, when few can still be on their way."""
         if not self._check:
             self._check = max(4 * self._asked, FEW)
         if self._asked < self._check:
@@ -279,20 +273,20 @@ class TeacherSampler(Sampler[int]):
         if 3 * out > self._asked:
             self._check = inf
             warnings.warn(
-                f"results of {out} of {self._asked} items have not come back: repeat, group and "
-                "rounds must be the loop's, and torch.distributed initialized on all ranks",
+                f"{out} of {self._asked} items have no results yet: repeat, group and rounds must "
+                "be those of the loop, and torch.distributed must be initialized on all ranks",
                 stacklevel=4,
             )
 
 
 class MixedGroups(NamedTuple):
-    """Groups whose answers differ, and what they have cost.
+    """Groups whose answers differ, and what they cost.
 
     Attributes:
-        items: of the groups, [m].
-        success: of their answers, float64 [m, G].
-        places: of the groups among all that were generated, one call after another, int64 [m].
-        rollouts: answers that were generated, those of groups that were thrown away among them.
+        items: the item of each group, [m].
+        success: success of its answers, float64 [m, G].
+        places: its place among all groups that were generated, in order, int64 [m].
+        rollouts: number of answers that were generated, including those of discarded groups.
     """
 
     items: list[int]
@@ -305,22 +299,21 @@ class MixedGroups(NamedTuple):
 def mixed_groups(
     teacher: Teacher, count: Count, generate: Callable[[list[int]], Any], *, most: Count = 10
 ) -> MixedGroups:
-    """Draws items until enough groups of answers are mixed, as in DAPO's dynamic sampling.
+    """Draws items until enough groups have different answers, as in DAPO's dynamic sampling.
 
-    GRPO learns nothing from a group whose answers are all alike. The teacher draws another item in
-    its place; its result counts for the curriculum like all others.
+    GRPO learns nothing from a group whose answers are all alike. The teacher then draws another
+    item; the result counts for the curriculum all the same.
 
     Args:
-        teacher: of :class:`Items`, with a ``block`` of about ``count``.
-        count: how many groups are to be mixed.
-        generate: of items [n] the success of G answers to each, from 0 to 1, [n, G].
-        most: calls of it, after which there may be fewer groups.
+        teacher: a teacher of :class:`Items`.
+        count: number of groups with different answers to return.
+        generate: returns for items [n] the success of G answers to each, from 0 to 1, [n, G], with
+            the same G from 2 at every call.
+        most: number of calls of ``generate`` after which fewer groups are returned.
 
     Raises:
-        ArgumentError: if its results are no such numbers, or G is 1 or another than before, whose
-            items are dropped then; if the teacher's levels are no items.
+        ArgumentError: if ``generate`` returns something else; its items are then dropped.
     """
-    items_of(teacher)
     drawn: list[int] = []
     groups: list[Tensor] = []
     places: list[int] = []
@@ -328,19 +321,13 @@ def mixed_groups(
     for _ in range(most):
         tickets, items = teacher.ask(count - len(places))
         try:
-            given = as_numbers("generate", generate(items.tolist()), (len(items), None), 0, 1)
+            size = groups[0].shape[1] if groups else None
+            given = as_numbers("generate", generate(items.tolist()), (len(items), size), 0, 1)
             success = torch.from_numpy(given)
-            size = success.shape[1]
-            if size < 2 or (groups and size != groups[0].shape[1]):
-                before = f", first {groups[0].shape[1]}" if groups else ""
-                raise ArgumentError(
-                    f"generate: must give groups of one size from 2, got {size}{before}"
-                )
             means = success.mean(1)
             teacher.tell(tickets, means, means, episodes=success.shape[1])
-        except BaseException:
-            teacher.drop(tickets)
-            raise
+        finally:
+            teacher.drop(tickets)  # those that could not be told
         mixed = (success != success[:, :1]).any(1).nonzero().flatten()
         places += (mixed + len(drawn)).tolist()
         drawn += items.tolist()
@@ -354,19 +341,8 @@ def mixed_groups(
     )
 
 
-def items_of(teacher: Teacher) -> Items:
-    """Returns the items that a teacher proposes.
-
-    Raises:
-        ArgumentError: if its levels are no items.
-    """
-    if not isinstance(teacher.space, Items):
-        raise ArgumentError("teacher: must have a space of Items")
-    return teacher.space
-
-
 def _everywhere(read: Callable[[], list[T]], trace: int) -> list[T]:
-    """Returns what all ranks read, rank by rank; what one refuses is refused by all."""
+    """Returns what all ranks read, in their order; an error of one is raised by all."""
     try:
         mine, error = read(), ""
     except ArgumentError as refused:
@@ -378,8 +354,8 @@ def _everywhere(read: Callable[[], list[T]], trace: int) -> list[T]:
         distributed.all_gather_object(said, said[0])
     if len({trace for trace, _, _ in said}) > 1:
         raise ArgumentError(
-            "teacher: has drawn other items on other ranks; each needs the same seed and state, "
-            "and must draw in step"
+            "teacher: has drawn other items on other ranks; give all of them the same seed and "
+            "state, and draw in step"
         )
     for _, error, _ in said:
         if error:
@@ -390,7 +366,7 @@ def _everywhere(read: Callable[[], list[T]], trace: int) -> list[T]:
 def _answers(
     items: Any, success: Any, return_: Any, episodes: Any
 ) -> list[tuple[int, Answer | None]]:
-    """Returns the answers to items [n], each with its item."""
+    """Returns answers to items [n], each with its item."""
     numbers = as_ids("items", items).tolist()
     count = len(numbers)
     came = [True] * count

@@ -1,4 +1,4 @@
-"""The teacher's log in the learner's own, for Stable-Baselines3."""
+"""A callback that adds a teacher's log to that of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from proposer_rl.teaching.teacher import Teacher
 
 
 class TeacherCallback(BaseCallback):
-    """Records the curriculum's log after each rollout, as ``teacher/NAME``.
+    """Records the teacher's log after each rollout, as ``teacher/NAME``.
 
-    Where an entry has a number for each student or bin, the mean is recorded.
+    An entry that is a list of numbers, such as one for each bin, is recorded as their mean.
 
     Args:
-        teacher: of the environments that the learner trains in.
+        teacher: the teacher of the environments that the learner trains in.
     """
 
     def __init__(self, teacher: Teacher) -> None:
@@ -26,7 +26,7 @@ class TeacherCallback(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         for name, value in self._teacher.log().items():
-            if isinstance(value, dict):  # by names of its own, as what was drawn
+            if isinstance(value, dict):  # such as the numbers of draws by bin
                 continue
             leaves = tree_leaves(value, is_leaf=lambda entry: not isinstance(entry, list))
             numbers = [float(entry) for entry in leaves if isinstance(entry, Real)]

@@ -1,14 +1,15 @@
-"""Spaces of levels for loops of one's own: named ranges, items of a data set, a generator.
+"""Spaces of levels for your own training loop: named ranges, items of a data set, a generator.
 
-They give curricula what a task gives them: levels to draw, bins, and where it is said a target and
-small edits. Inside, a level is a tensordict; what a loop gets is :meth:`LevelSpace.given`.
+A space offers curricula what a task does: levels to draw, and depending on the space bins, a target
+and small edits. Curricula see levels as tensordicts; :meth:`LevelSpace.given` converts them for the
+loop.
 """
 
 from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -17,9 +18,9 @@ from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from torch import Tensor
 
 from proposer_rl.models import check_torch_defaults
-from proposer_rl.settings import ArgumentError, WholeKeyError, plain, shown, whole
+from proposer_rl.settings import ArgumentError, plain, shown, whole
 from proposer_rl.task import Distribution, Levels, space_features
-from proposer_rl.tasks.parameters import SEED, Bins, Law, ParameterSpace
+from proposer_rl.tasks.parameters import Bins, Law, ParameterSpace
 from proposer_rl.tasks.ranges import (
     inside,
     python_values,
@@ -27,7 +28,7 @@ from proposer_rl.tasks.ranges import (
     read_part,
     target_in_file,
 )
-from proposer_rl.teaching.numbers import as_numbers
+from proposer_rl.teaching.numbers import as_ids, as_numbers
 from proposer_rl.teaching.tables import (
     expected_log_odds,
     few_columns,
@@ -36,19 +37,20 @@ from proposer_rl.teaching.tables import (
     rate_columns,
 )
 
-DRAWN = "level"  # the entry that holds a generator's tensors
+DRAWN = "level"  # the entry of levels that are plain tensors
 Ranges = Mapping[str, Any]
 T = TypeVar("T")
 
+Make = Callable[[TensorDictBase, torch.Generator], Any]
 Features = Callable[[Any], Any]
-"""Gives numbers [n, F] that tell levels [n] apart, each about -1 to 1."""
+"""Returns numbers [n, F] that describe levels [n], each about -1 to 1."""
 
 
 class LevelSpace:
-    """A task of levels alone, as curricula take one.
+    """The base of spaces: a task for curricula that consists of levels only.
 
     Attributes:
-        distributions: by name, for hand-designed curricula; ``all`` is the space itself.
+        distributions: distributions of levels by name; ``all`` is the space itself.
     """
 
     distributions: Mapping[str, Distribution]
@@ -56,27 +58,27 @@ class LevelSpace:
 
     @property
     def space(self) -> LevelSpace:
-        """Returns what levels are chosen from."""
+        """Returns the space, as tasks do."""
         return self
 
     @property
     def target(self) -> Distribution:
-        """Returns what is to be mastered.
+        """Returns the distribution of levels that is to be mastered.
 
         Raises:
-            ArgumentError: if nothing was said of it.
+            ArgumentError: if no target was given.
         """
         if "target" not in self.distributions:
-            raise ArgumentError("target: missing: this curriculum needs a target of the space")
+            raise ArgumentError("target: missing: this curriculum needs a space with a target")
         return self.distributions["target"]
 
     @property
     def description(self) -> dict[str, Any]:
-        """Returns what states are compared by: nested dicts of numbers and texts, for JSON."""
+        """Describes the space, to compare states by: nested dicts of numbers and texts."""
         return {"kind": type(self).__qualname__}
 
     def features(self, levels: Levels) -> Tensor:
-        """Returns what a model of outcomes knows of levels: float [*B, F]."""
+        """Returns features of levels, by which models of outcomes predict: float [*B, F]."""
         if self._features is None:
             return space_features(self, levels)
         shape = levels.shape
@@ -84,42 +86,43 @@ class LevelSpace:
         return known.reshape(*shape, known.shape[1])
 
     def given(self, levels: Levels) -> Any:
-        """Returns levels [*B] as a loop gets them."""
+        """Returns levels [*B] as the loop gets them."""
         return levels
 
     def rows(self, levels: Levels) -> list[Any]:
-        """Returns levels [n] one by one, for a loop that plays episode by episode."""
+        """Returns levels [n] as a list, for loops that play episode by episode."""
         return list(self.given(levels).unbind(0))
 
 
 class Parameters(LevelSpace, ParameterSpace):
     """Levels that are values of named parameters.
 
-    In batches a level is a tensordict with an entry for each parameter, in torch's default floating
-    dtype or int64: of other choices than numbers the place in their list. One by one it is a dict
-    of numbers and texts.
+    A batch of levels is a tensordict with an entry for each parameter: torch's default floating
+    dtype for real numbers, int64 for whole ones; choices that are not numbers are their places in
+    the list. A single level is a dict of numbers and texts.
 
     Args:
-        ranges: of each parameter, by name: ``(low, high)`` for a continuous range, ``prl.Log(low,
-            high)`` for one on a logarithmic scale, ``range(a, b)`` for whole numbers, a list or an
-            array for choices among rising numbers, or among texts. Or what task files have:
-            ``{"low", "high", "bins", "log", "target"}`` or ``{"values", "target"}``. YAML and JSON
-            have no tuples: their ``[5.0, 25.0]`` is two choices, but as the target of such a
-            mapping a range.
-        bins: equal parts of a range that curricula tell apart; one number for all, or by name. Of
-            twenty parameters or more, 1.
-        target: what is to be mastered, for some of the parameters, by name: values, or a part of
-            the range as in ``ranges``; ``{"values", "weights"}``, or ``{"distribution": "norm",
-            "loc", "scale"}``. It goes before the targets in ``ranges``; parameters without one
-            have all of theirs. None for no target.
+        ranges: the values of each parameter, by name: ``(low, high)`` for a continuous range,
+            ``prl.Log(low, high)`` for one on a logarithmic scale, ``range(a, b)`` for whole
+            numbers, a list or an array for choices among rising numbers or among texts. Or as in
+            task files: ``{"low", "high", "bins", "log", "target"}`` or ``{"values", "target"}``.
+            Note that a list ``[5.0, 25.0]``, as YAML and JSON have it, means two choices, and only
+            as the target of such a mapping a range.
+        bins: number of equal parts of each range that curricula tell apart, for all parameters or
+            by name. Give 1 for twenty parameters or more.
+        target: the levels that are to be mastered, for some of the parameters by name: a value or
+            several, a part of the range as in ``ranges``, ``{"values", "weights"}``, or
+            ``{"distribution": "norm", "loc", "scale"}``. It overrides targets in ``ranges``; other
+            parameters keep their whole range. None for no target.
         named: further distributions like ``target``, by name, for hand-designed curricula.
-        seeded: whether each level has a ``seed``, a whole number from which its episodes begin.
+        seeded: whether each level has a ``seed``, a whole number to reset its episodes with.
 
     Attributes:
-        labels: of each parameter, by name: its values, where they are texts; else None.
+        labels: the choices of each parameter that has texts, by name; None for the others.
 
     Raises:
-        ArgumentError: naming the parameter, for what is no range or lies outside of it.
+        ArgumentError: naming the parameter, for something that is no range or not within it.
+        ValueError: if the combinations of the parameters' bins are too many to be numbered.
 
     Example:
         >>> space = Parameters({"gravity": (5.0, 25.0), "ground": ["flat", "stairs"]}, bins=4)
@@ -138,14 +141,12 @@ class Parameters(LevelSpace, ParameterSpace):
         seeded: bool = False,
     ) -> None:
         check_torch_defaults()
-        if seeded and SEED in ranges:
-            raise ArgumentError("ranges.seed, seeded=True: a level has one seed; leave out either")
         named_bins = bins if isinstance(bins, Mapping) else {}
         _check_names("bins", named_bins, ranges)
         counts = dict.fromkeys(ranges, 8 if bins is named_bins else whole("bins", bins, 1))
         counts |= {name: whole(f"bins.{name}", count, 1) for name, count in named_bins.items()}
         ranges = {name: python_values(given) for name, given in ranges.items()}
-        in_file = {  # as task files have it, within the range
+        in_file = {  # targets given as in task files
             name: given.pop("target")
             for name, given in ranges.items()
             if isinstance(given, dict) and "target" in given
@@ -153,13 +154,7 @@ class Parameters(LevelSpace, ParameterSpace):
         parts = {
             name: read_line(f"ranges.{name}", given, counts[name]) for name, given in ranges.items()
         }
-        try:
-            super().__init__(parts, seeded)
-        except ValueError as error:  # of many parameters
-            raise ArgumentError(
-                f"bins={bins}: too many combinations of the parameters' bins to be numbered; give "
-                "bins=1, which suffices for curricula that need none"
-            ) from error
+        super().__init__(parts, seeded)
         self.labels = {name: getattr(part, "labels", None) for name, part in parts.items()}
         if in_file:
             _check_names("target", target or {}, parts)
@@ -178,7 +173,7 @@ class Parameters(LevelSpace, ParameterSpace):
 
     @property
     def description(self) -> dict[str, Any]:
-        """Returns the parameters, their bins, and the target and what else was named."""
+        """Describes the parameters, their bins, the target and the named distributions."""
         named: dict[str, Any] = {name: self._said(part) for name, part in self._parts.items()}
         target = {"target": named.pop("target")} if "target" in named else {}
         counts = {name: len(part.low) for name, part in self.bins.items() if part.wide}
@@ -192,7 +187,7 @@ class Parameters(LevelSpace, ParameterSpace):
         }
 
     def _said(self, parts: Mapping[str, Bins]) -> dict[str, str]:
-        """Returns each parameter's values as a text."""
+        """Describes each parameter's values as a text."""
         found = {}
         for name, part in parts.items():
             ends = part.low[0].item(), part.high[-1].item()
@@ -205,8 +200,7 @@ class Parameters(LevelSpace, ParameterSpace):
 
     def given(self, levels: TensorDictBase) -> TensorDictBase:
         """Returns levels as loops get them: real numbers in torch's default dtype."""
-        real = torch.get_default_dtype()
-        return levels.apply(lambda one: one.to(real) if one.is_floating_point() else one)
+        return in_default_dtype(levels)
 
     def rows(self, levels: TensorDictBase) -> list[dict[str, Any]]:
         """Returns levels [n] as dicts of numbers and texts."""
@@ -230,35 +224,123 @@ class Parameters(LevelSpace, ParameterSpace):
                 )
             if isinstance(part, Law) and inside(part, line) < 0.5:
                 warnings.warn(
-                    f"{where}: most of it, {part}, lies outside of {low:g} to {high:g}, and comes "
-                    "from the nearer end",
+                    f"{where}: most of {part} lies outside of {low:g} to {high:g}, so that most "
+                    "draws are at its nearer end",
                     stacklevel=4,
                 )
         return parts
 
 
-class Items(LevelSpace):
-    """The items of a data set, such as prompts: a level is the place of one of them, int64.
+class MadeLevels(Parameters):
+    """Levels that a function makes from parameters, such as terrains from slope and roughness.
 
-    Each is a bin of its own.
+    Curricula see the parameters: their bins, the target, and small edits, after which the level is
+    made anew. The loop gets only what the function returns.
+
+    Args:
+        ranges: the values of each parameter, by name; see :class:`Parameters`.
+        make: ``make(values, generator)`` returns levels [n] for a tensordict of values [n]: a
+            tensor or a tensordict. Real numbers are in torch's default dtype on both sides.
+        features: ``features(levels)`` returns numbers [n, F] that describe levels [n], each about
+            -1 to 1; None for the parameters.
+        bins, target, named: see :class:`Parameters`.
+
+    Raises:
+        ArgumentError: see :class:`Parameters`.
+
+    Example:
+        >>> def rows(values, generator):
+        ...     x = torch.linspace(0, 1, 5)
+        ...     return values["slope"].unsqueeze(-1) * x + torch.rand(len(values), 5)
+        >>> space = MadeLevels({"slope": (0.0, 8.0)}, rows, target={"slope": 8.0})
+        >>> space.size, space.given(space.sample(3, torch.Generator())).shape
+        (8, torch.Size([3, 5]))
+    """
+
+    def __init__(
+        self,
+        ranges: Ranges,
+        make: Make,
+        *,
+        features: Features | None = None,
+        bins: int | Mapping[str, int] = 8,
+        target: Ranges | None = None,
+        named: Mapping[str, Ranges] | None = None,
+    ) -> None:
+        super().__init__(ranges, bins=bins, target=target, named=named)
+        self._make, self._features = make, features
+        parts = {name: _Made(part, self) for name, part in self._parts.items()}
+        self.distributions = {"all": self, **parts}
+
+    def made(self, values: TensorDictBase, generator: torch.Generator) -> TensorDict:
+        """Makes levels [n] from values of the parameters [n], and stores the values with them."""
+        kept = values.select(*self.bins)
+        levels = self._make(in_default_dtype(kept.clone()), generator)
+        return TensorDict({**kept, DRAWN: in_default_dtype(levels)}, kept.batch_size)
+
+    def inputs(self, levels: TensorDictBase) -> Tensor:
+        """Returns the inputs of a belief for levels: their features, or else their parameters."""
+        return super().inputs(levels) if self._features is None else self.features(levels)
+
+    def given(self, levels: TensorDictBase) -> Any:
+        """Returns levels [*B] as the function made them."""
+        return levels[DRAWN]
+
+    def rows(self, levels: TensorDictBase) -> list[Any]:
+        """Returns levels [n] as a list."""
+        return LevelSpace.rows(self, levels)
+
+    def at(self, points: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
+        """Makes levels [K, P] at points of the box that the ranges span."""
+        values = zip(super().at(points, generators), generators, strict=True)
+        return torch.stack([self.made(own, g) for own, g in values])
+
+    def between(
+        self, a: TensorDictBase, b: TensorDictBase, noise: float, generator: torch.Generator
+    ) -> TensorDict:
+        """Makes levels [n] from values at random places between those of ``a`` and ``b``."""
+        return self.made(super().between(a, b, noise, generator), generator)
+
+    def _draw(self, choices: Tensor, generator: torch.Generator) -> TensorDict:
+        return self.made(super()._draw(choices, generator), generator)
+
+    def _edited(self, levels: TensorDictBase, count: int, generator: torch.Generator) -> TensorDict:
+        return self.made(super()._edited(levels, count, generator), generator)
+
+
+class _Made(ParameterSpace):
+    """A named distribution of a space of made levels."""
+
+    def __init__(self, bins: Any, whole: MadeLevels) -> None:
+        super().__init__(bins, seeded=False)
+        self._whole = whole
+
+    def _draw(self, choices: Tensor, generator: torch.Generator) -> TensorDict:
+        return self._whole.made(super()._draw(choices, generator), generator)
+
+
+class Items(LevelSpace):
+    """Levels that are the items of a data set, such as prompts: the place of each, int64.
+
+    Every item is a bin.
 
     Args:
         count: number N of items.
-        features: what items are like, such as source, length, difficulty or an embedding: numbers
-            [N, D] on any scale as a tensor or an array; or a table, columns by name, or rows, in
-            which texts are categories. None for their places alone.
-        pass_rates: how often another model, or this one before, solves each, from 0 to 1, [N]; NaN
-            where that is not known. A belief begins with them, and outgrows them.
-        target: places of those that are to be mastered; None for no target.
+        features: a description of the items, such as source, length, difficulty or an embedding:
+            numbers [N, D] on any scale as a tensor or an array; or a table, columns by name, or
+            rows, in which texts are categories. None if there is none.
+        pass_rates: the share of attempts at each item that another or an earlier model solved, from
+            0 to 1, [N]; NaN where it is unknown. Curricula with a belief start from them.
+        target: places of the items that are to be mastered; None for no target.
         named: further distributions like ``target``, by name.
 
     Raises:
-        ArgumentError: if there is no item, or not a row of features or a pass rate for each.
+        ArgumentError: if there is no item, or not one row of features or pass rate for each.
 
     Attributes:
-        categories: the number of each item's category, int64 [N]; None where no feature is a text.
+        categories: the number of each item's category, int64 [N]; None if no feature is a text.
         pass_rates: float64 [N], or None.
-        expected: log odds of success on each by its pass rate, float64 [N]; None without any.
+        expected: log odds of success on each item by its pass rate, float64 [N], or None.
 
     Example:
         >>> sums = {"source": ["add", "add", "times"], "digits": [1, 6, 2]}
@@ -283,14 +365,7 @@ class Items(LevelSpace):
         lines, self.categories = item_table(
             torch.arange(count).unsqueeze(-1) if features is None else features
         )
-        if lines.ndim != 2 or len(lines) != count:
-            raise ArgumentError(
-                f"features={list(lines.shape)}: must be [{count}, D], a row for each item"
-            )
-        if len(wrong := (~lines.float().isfinite()).nonzero()):
-            number = lines[tuple(wrong[0])]
-            what = f"must be finite in float32, as of item {int(wrong[0, 0])}"
-            raise ArgumentError(f"features={number:g}: {what}")
+        as_numbers("features", lines, (count, None))
         self.pass_rates = self.expected = None
         columns = known = torch.zeros(count, 0)
         if pass_rates is not None:
@@ -304,7 +379,7 @@ class Items(LevelSpace):
         low, high = lines.amin(0), lines.amax(0)
         self.coordinates = (2 * (lines - low) / (high - low).clamp_min(1e-12) - 1).float()
         self._parts = {
-            name: _SomeItems(torch.tensor(_item_places(name, given, count)))
+            name: _SomeItems(torch.from_numpy(as_ids(name, given, count)))
             for name, given in _distributions(target, named).items()
         }
         self.distributions = {"all": self, **self._parts}
@@ -317,7 +392,7 @@ class Items(LevelSpace):
 
     @property
     def description(self) -> dict[str, Any]:
-        """Returns how many there are, a hash of their features, and the places of the target."""
+        """Describes the items: their number, a hash of their features, the target's places."""
         rates = {} if self.pass_rates is None else {"pass_rates": _hash(self.pass_rates)}
         places = {name: one.places.tolist() for name, one in self._parts.items()}
         return {
@@ -329,20 +404,19 @@ class Items(LevelSpace):
         }
 
     def locate(self, levels: TensorDictBase) -> Tensor:
-        """Returns where items lie, float32 [*B, D]."""
+        """Returns coordinates of items, each from -1 to 1: float32 [*B, D]."""
         return self.coordinates[levels["item"]]
 
     def inputs(self, levels: TensorDictBase) -> Tensor:
-        """Returns what a belief knows of items, float32 [*B, D]: ranks, from -1 to 1.
+        """Returns the inputs of a belief for items: ranks from -1 to 1, float32 [*B, D].
 
-        A belief takes 24. Where there is no room for all features beside the pass rates, they are
-        those of the first principal components. A place in a list says nothing, so that D is 0
-        without features and pass rates.
+        D is at most 24: if there are too many features beside the pass rates, the ranks are those
+        of the first principal components. Without features and pass rates D is 0.
         """
         return self._inputs[levels["item"]]
 
     def items(self, levels: TensorDictBase) -> Tensor:
-        """Returns the places of items, int64 [*B], each with a memory of its own."""
+        """Returns the places of items, int64 [*B], by which beliefs remember each of them."""
         return levels["item"]
 
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
@@ -373,20 +447,17 @@ class _SomeItems:
 
 
 class LevelGenerator(LevelSpace):
-    """Levels that a function draws; there are no bins.
+    """Levels that a function draws, without bins.
 
     Args:
-        draw: ``draw(n, generator)`` gives levels [n]: a tensor, a tensordict or a tensorclass; an
-            array is taken as a tensor.
-        target: the same for what is to be mastered; None for no target.
-        edit: ``edit(levels, count, generator)``: levels [n] after so many small random edits; None
-            where levels cannot be edited.
-        features: ``features(levels)`` gives numbers [n, F] that tell levels [n] apart, each about
+        draw: ``draw(n, generator)`` gives levels [n]: a tensor, a tensordict, a tensorclass or an
+            array, which becomes a tensor. Real numbers become those of torch's default dtype.
+        target: a function like ``draw`` for the levels that are to be mastered; None for no target.
+        edit: ``edit(levels, count, generator)`` returns levels [n] after ``count`` small random
+            edits; None if levels cannot be edited.
+        features: ``features(levels)`` returns numbers [n, F] that describe levels [n], each about
             -1 to 1; None for none.
         named: further functions like ``draw``, by name, for hand-designed curricula.
-
-    Raises:
-        ArgumentError: if levels are no such thing, or not as many as are asked for.
     """
 
     def __init__(
@@ -399,9 +470,8 @@ class LevelGenerator(LevelSpace):
         named: Mapping[str, Callable[[int, torch.Generator], Any]] | None = None,
     ) -> None:
         self._features = features
-        drawn = _distributions(target, named)
-        parts = {name: _Drawn(name, function) for name, function in drawn.items()}
-        self.distributions = {"all": _Drawn("draw", draw), **parts}
+        functions = {"all": draw, **_distributions(target, named)}
+        self.distributions = {name: _Drawn(function) for name, function in functions.items()}
         if edit is not None:
             self.edit = self._edits(edit)
 
@@ -410,23 +480,19 @@ class LevelGenerator(LevelSpace):
         return self.distributions["all"].sample(count, generator)
 
     def inputs(self, levels: Levels) -> Tensor:
-        """Returns the features of levels, float [*B, F]; without a function, F is 0."""
+        """Returns the features of levels, float [*B, F]; F is 0 without a function."""
         return torch.zeros(*levels.shape, 0) if self._features is None else self.features(levels)
 
     def given(self, levels: Levels) -> Any:
-        """Returns levels as the function gives them."""
+        """Returns levels as the function draws them."""
         return levels[DRAWN] if DRAWN in levels.keys() else levels
 
     @property
     def axes(self) -> Any:
-        """Refuses, as there are no bins.
-
-        Raises:
-            ArgumentError: always.
-        """
+        """Raises an ArgumentError, as there are no bins."""
         raise ArgumentError(
-            "space: this curriculum draws from bins, which a generator of levels has not; give "
-            "Parameters, Items or a task"
+            "space: this curriculum draws from bins, which a generator of levels does not have; "
+            "give Parameters, Items or a task"
         )
 
     size = coordinates = generate = target_shares = axes
@@ -435,7 +501,7 @@ class LevelGenerator(LevelSpace):
         def edited(levels: Levels, count: int, generators: Sequence[torch.Generator]) -> Levels:
             rows = zip(levels, generators, strict=True)
             made = [(edit(self.given(own), count, g), len(own)) for own, g in rows]
-            return torch.stack([_taken("edit", new, n) for new, n in made])
+            return torch.stack([_taken(new, n) for new, n in made])
 
         return edited
 
@@ -443,42 +509,36 @@ class LevelGenerator(LevelSpace):
 class _Drawn:
     """Draws levels by a function."""
 
-    def __init__(self, name: str, draw: Callable[[int, torch.Generator], Any]) -> None:
-        self._name, self._draw = name, draw
+    def __init__(self, draw: Callable[[int, torch.Generator], Any]) -> None:
+        self._draw = draw
 
     def sample(self, count: int, generator: torch.Generator) -> Levels:
-        return _taken(self._name, self._draw(count, generator), count)
+        return _taken(self._draw(count, generator), count)
 
 
-def _taken(name: str, levels: Any, count: int) -> Levels:
-    """Returns levels [count] that a function gives, as curricula take them."""
-    if isinstance(levels, np.ndarray):
-        levels = torch.from_numpy(levels.copy())
-    collection = is_tensor_collection(levels)
-    if not (collection or isinstance(levels, Tensor)) or tuple(levels.shape[:1]) != (count,):
-        found = list(getattr(levels, "shape", ())) or type(levels).__name__
-        raise WholeKeyError(f"{name}={found}: must give a tensor or tensordict of {count} levels")
-    return levels if collection else TensorDict({DRAWN: levels}, [count])
+def _taken(levels: Any, count: int) -> Levels:
+    """Returns levels [count] of a user's function as a tensordict."""
+    if is_tensor_collection(levels):
+        return in_default_dtype(levels)
+    if not isinstance(levels, Tensor):
+        levels = torch.from_numpy(np.array(levels))  # a copy, as it may have negative strides
+    return TensorDict({DRAWN: in_default_dtype(levels)}, [count])
+
+
+def in_default_dtype(levels: Any) -> Any:
+    """Returns levels with their real numbers in torch's default dtype, as networks have theirs."""
+    real = torch.get_default_dtype()
+    if isinstance(levels, Tensor):
+        return levels.to(real) if levels.is_floating_point() else levels
+    return levels.apply(in_default_dtype)
 
 
 def _hash(numbers: Tensor) -> str:
     return hashlib.sha256(numbers.contiguous().numpy().tobytes()).hexdigest()[:16]
 
 
-def _item_places(name: str, given: Any, count: int) -> list[int]:
-    """Returns places of items, also of a single one, as a list."""
-    places = plain(given)
-    places = [*places] if isinstance(places, Iterable) else [places]
-    if not places or not all(type(one) is int and 0 <= one < count for one in places):
-        raise ArgumentError(f"{name}={shown(places)}: must be places from 0 to {count - 1}")
-    return places
-
-
 def _distributions(target: T | None, named: Mapping[str, T] | None) -> dict[str, T]:
-    """Returns what is said of distributions beside the space itself, by their names."""
-    for name in named or {}:
-        if name == "all" or (name == "target" and target is not None):
-            raise ArgumentError(f"named.{name}: must have another name, which none has yet")
+    """Returns the distributions beside the space itself, by name."""
     return {**({} if target is None else {"target": target}), **(named or {})}
 
 

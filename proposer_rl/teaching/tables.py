@@ -1,4 +1,4 @@
-"""Turns features of items and levels into tables of numbers: categories, ranks, few columns."""
+"""Turns features of items and levels into tables of numbers."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from proposer_rl.curricula.belief import WIDEST
 from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching.numbers import as_numbers
 
-MOST_TEXTS = 256  # that differ in a column, which is a category
-OUTLIER = 3.0  # standard deviations, beyond which a number of many counts as that
-ANSWERS = 16.0  # that a pass rate is taken for the mean of
+MOST_TEXTS = 256  # different texts of a category
+OUTLIER = 3.0  # standard deviations at which numbers of wide tables are cut off
+ANSWERS = 16.0  # number of answers that a pass rate is assumed to be the mean of
 
 
 class Table(NamedTuple):
     """The features of N items.
 
     Attributes:
-        numbers: float or int64 [N, D]; of a column of texts a column for each of them, 0 or 1.
-        categories: numbers of the texts of each item, counted from 0, int64 [N]; None without any.
+        numbers: float or int64 [N, D]; a column of texts becomes one column for each, 0 or 1.
+        categories: the number of each item's combination of texts, int64 [N]; None without texts.
     """
 
     numbers: Tensor
@@ -32,21 +32,21 @@ class Table(NamedTuple):
 
 
 def number_table(features: Any) -> Tensor:
-    """Returns numbers [N, D], whatever they are given as."""
+    """Returns numbers [N, D] of any library as a tensor."""
     array = hasattr(features, "__array__") and not isinstance(features, Tensor)
     if isinstance(features, np.ma.MaskedArray):
         features = np.ma.filled(features.astype(np.float64), np.nan)
     table = torch.as_tensor(np.array(features) if array else features)
-    return table if table.is_floating_point() else table.long()  # small integers would overflow
+    return table if table.is_floating_point() else table.long()  # differences of int8 overflow
 
 
 def item_table(features: Any) -> Table:
-    """Returns what a table, columns by name, or rows say of items.
+    """Reads features of items, given as a table, as columns by name, or as rows.
 
-    A column whose first entry that is not missing is a text is a category.
+    A column is a category if its first entry that is not missing is a text.
 
     Raises:
-        ArgumentError: naming the column that has neither numbers nor few texts.
+        ArgumentError: naming a column that has neither numbers nor few texts.
     """
     columns = _columns(features)
     texts = [_begins_with_text(column) for column in columns.values()]
@@ -60,8 +60,8 @@ def item_table(features: Any) -> Table:
         found, code = np.unique([*map(str, column)], return_inverse=True)
         if len(found) > MOST_TEXTS:
             raise ArgumentError(
-                f"features.{name}: has {len(found):,} texts that differ; a category may have "
-                f"{MOST_TEXTS}; say in numbers what other texts are like"
+                f"features.{name}: has {len(found):,} different texts, but a category may have "
+                f"{MOST_TEXTS}; describe other texts by numbers"
             )
         codes.append(torch.from_numpy(code.reshape(-1)))
         parts.append(torch.nn.functional.one_hot(codes[-1], len(found)).double())
@@ -70,7 +70,7 @@ def item_table(features: Any) -> Table:
 
 
 def _columns(features: Any) -> dict[str, Any]:
-    """Returns columns by name, of rows with texts by place; nothing where all are numbers."""
+    """Returns columns by name, or by place for rows with texts; nothing if all are numbers."""
     is_series = getattr(features, "ndim", 2) == 1 and not isinstance(features, Mapping)
     if hasattr(features, "items") and not is_series:
         return {str(name): column for name, column in features.items()}
@@ -81,7 +81,7 @@ def _columns(features: Any) -> dict[str, Any]:
 
 
 def _begins_with_text(cells: Any) -> bool:
-    """Returns whether the first of some cells that is there, or one in the first row, is a text."""
+    """Returns whether the first cell that is not missing, or one in the first row, is a text."""
     there = (cell for cell in cells if not _is_missing(cell)) if hasattr(cells, "__iter__") else ()
     first = next(iter(there), None)
     inner = first if isinstance(first, list | tuple | np.ndarray) else [first]
@@ -115,11 +115,11 @@ def ranks(table: Tensor) -> Tensor:
 
 
 def few_columns(table: Tensor, others: int = 0) -> Tensor:
-    """Returns ranks [N, D], of wide tables those of their first principal components.
+    """Returns ranks [N, D]; for wide tables, those of the first principal components.
 
     Args:
         table: finite numbers [N, D].
-        others: columns that a belief gets beside them, which would project what is wider.
+        others: number of further columns that a belief gets, for which to leave room.
 
     Returns:
         float32 [N, min(D, WIDEST - others)].
@@ -134,7 +134,7 @@ def few_columns(table: Tensor, others: int = 0) -> Tensor:
 
 
 def rate_columns(rates: Tensor) -> Tensor:
-    """Returns what pass rates [N] say, NaN where there is none: float32 [N, 1], or 2 with these."""
+    """Returns the ranks of pass rates [N], float32 [N, 1]; with NaN a second column marks those."""
     missing = rates.isnan()
     known = torch.zeros(len(rates), 1)
     known[~missing] = ranks(rates[~missing].unsqueeze(1))
@@ -142,9 +142,9 @@ def rate_columns(rates: Tensor) -> Tensor:
 
 
 def expected_log_odds(rates: Tensor) -> Tensor:
-    """Returns the log odds of pass rates, each the mean of some answers: float64 [N].
+    """Returns the log odds of pass rates, each smoothed as a mean of 16 answers: float64 [N].
 
-    Where a rate is missing, NaN, they are the mean of the others.
+    Missing rates, NaN, get the mean of the others.
     """
     odds = ((rates.double() * ANSWERS + 0.5) / (ANSWERS + 1)).logit()
     return odds.where(~odds.isnan(), odds.nanmean().nan_to_num(0.0))

@@ -1,4 +1,4 @@
-"""Counts for a teacher's log, whatever the curriculum: levels handed out, results returned."""
+"""Counts for a teacher's log: levels that were handed out, and their results."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from proposer_rl.task import Levels
 from proposer_rl.tasks.parameters import ParameterSpace
 from proposer_rl.teaching.spaces import Items
 
-MOST_PARTS = 64  # of a data set, whose items are counted in
-MOST_BINS = 4096  # of a space that only has coordinates, among which the nearest is searched
+MOST_PARTS = 64  # parts of a data set in which items are counted
+MOST_BINS = 4096  # bins among which the nearest is searched, in spaces with coordinates only
 
 
 class Tally:
-    """The counts of one teacher since they were last read.
+    """Counts a teacher's levels and results between two readings.
 
     Args:
-        space: of the levels, or a task.
+        space: the space of the levels, or a task.
     """
 
     def __init__(self, space: Any) -> None:
@@ -35,24 +35,22 @@ class Tally:
             self._drawn[name] += bins.bincount(minlength=len(self._texts[name]))
 
     def returned(self, tickets: int, returns: Any, success: Any = None) -> None:
-        """Counts the results of tickets, numbers or arrays."""
+        """Counts the results of tickets, arrays or NumPy's scalars."""
         self._returned += tickets
         for name, values in (("return", returns), ("success", success)):
             if values is not None:
                 total, number = self._sums.get(name, (0.0, 0))
-                more = getattr(values, "size", 1)
-                added = float(values.sum()) if hasattr(values, "sum") else values
-                self._sums[name] = total + added, number + more
+                self._sums[name] = total + float(values.sum()), number + values.size
 
     def dropped(self, tickets: int) -> None:
         """Counts tickets that were given up."""
         self._dropped += tickets
 
     def read(self, out: int) -> dict[str, Any]:
-        """Returns what was counted, for JSON; counts begin anew.
+        """Returns the counts, for JSON, and resets them.
 
         Args:
-            out: levels that are out now.
+            out: number of levels that are out now.
         """
         means = {name: total / number for name, (total, number) in self._sums.items()}
         found = {
@@ -96,7 +94,7 @@ class Tally:
 
 
 def _bin_texts(space: Any) -> dict[str, list[str]]:
-    """Returns the names of the bins of each axis; nothing where there are no bins."""
+    """Returns the names of the bins of each axis; nothing if there are no bins."""
     if isinstance(space, ParameterSpace):
         return {name: part.texts for name, part in space.bins.items()}
     if isinstance(space, Items):

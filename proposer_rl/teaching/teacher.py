@@ -1,4 +1,4 @@
-"""The teacher: a curriculum in any loop, which takes levels and brings results."""
+"""The teacher: a curriculum in any training loop, which asks for levels and tells results."""
 
 from __future__ import annotations
 
@@ -29,9 +29,8 @@ from proposer_rl.runs.folder import storage
 from proposer_rl.settings import ArgumentError, Count, checked, whole
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels, Task
-from proposer_rl.teaching.abilities import adapted
 from proposer_rl.teaching.identity import of_levels, require_same
-from proposer_rl.teaching.making import make_curriculum
+from proposer_rl.teaching.making import adapted, make_curriculum
 from proposer_rl.teaching.numbers import as_ids
 from proposer_rl.teaching.remote import TeacherClient, TeacherServer
 from proposer_rl.teaching.results import (
@@ -41,16 +40,22 @@ from proposer_rl.teaching.results import (
     as_result,
     by_name,
     ended,
-    outcome_of_rollout,
+    results_of_rollout,
 )
-from proposer_rl.teaching.spaces import LevelSpace
+from proposer_rl.teaching.spaces import LevelSpace, in_default_dtype
 from proposer_rl.teaching.tally import Tally
 
+HOW = {  # to give results that are missing
+    "success": "tell it of every level, also of failures, as with tell(..., success=), or give "
+    'success="terminated" to LevelTransform, TaughtEnv or, for rollouts, Teacher',
+    "rollout": "give rollouts to observe(), as with LevelTransform(tell=False)",
+}
+LEAST_BLOCK, LARGEST_BLOCK = 32, 384  # tickets, where the loop does not say how many
 Success = Literal["terminated", "truncated"] | Callable[[TensorDictBase], Tensor]
 
 
 class Teacher:
-    """Proposes the levels of a space by a curriculum, and observes what came of them.
+    """Chooses the levels that your training loop plays, and learns from the results.
 
     In batches, one after another:
 
@@ -62,32 +67,34 @@ class Teacher:
         ticket, level = teacher.ask()            # or ids, levels = teacher.ask(4096)
         teacher.tell(ticket, return_=r, success=ok)
 
-    The curriculum observes results when it proposes next, at every ``block`` tickets. Replay
-    draws blocks of more than 128 levels at once, which costs a fraction of one after another.
-    Whatever is refused counts nothing, and leaves the teacher as it was.
+    The curriculum proposes a block of levels at once, and observes the results that came in the
+    meantime just before it does so. A refused call has no effect.
 
     Args:
-        curriculum: ``prl.curricula.NAME(...)``, its name, or a curriculum of one's own or its
-            class, which is then made by its ``create``.
+        curriculum: ``prl.curricula.NAME(...)``, its name, or a curriculum of your own: an object,
+            or a class, of which ``create`` makes one.
         space: :class:`~proposer_rl.teaching.Parameters`, :class:`~proposer_rl.teaching.Items`,
-            :class:`~proposer_rl.teaching.LevelGenerator`, or a task.
-        seed: of every random draw.
-        device: where levels and tickets are given.
-        filter: of the proposed levels, as of :func:`proposer_rl.train`.
-        block: tickets that the curriculum proposes at once; fewer where episodes are few.
-        success: what in a rollout is a success where it has no such entry: ``"terminated"``,
-            ``"truncated"``, or a function of its ``next``; None where termination may be a failure.
-        student: what the curriculum may ask of; None for one that can do what ``can`` says.
-        can: functions by their names, as of :class:`~proposer_rl.curricula.Student`, of which
-            ``performance``, ``exact_performance``, ``optimal_return`` and ``play`` are called with
-            levels [n] as :meth:`propose` gives them.
+            :class:`~proposer_rl.teaching.LevelGenerator`,
+            :class:`~proposer_rl.teaching.MadeLevels`, or a task.
+        seed: seed of all random draws.
+        device: device of the levels and tickets that the loop gets.
+        filter: filter of the proposed levels, as of :func:`proposer_rl.train`.
+        block: number of levels that the curriculum proposes at once. None for as many as the loop
+            has out at that moment, from 32 to 384; never fewer than it asks for.
+        success: what counts as a success in rollouts that have no entry ``success``:
+            ``"terminated"``, ``"truncated"``, or a function of their ``next``. None if nothing
+            does, as where termination may be a failure.
+        student: what the curriculum can ask about the learner; None for the functions in ``can``.
+        can: functions of :class:`~proposer_rl.curricula.Student`, by their names. Of these,
+            ``performance``, ``exact_performance``, ``optimal_return`` and ``play`` get levels [n]
+            as :meth:`propose` returns them.
 
     Attributes:
-        id: a text that no other teacher has; a checkpoint keeps it, and each line of a log.
+        id: a text that identifies the teacher in logs; a checkpoint keeps it.
 
     Raises:
         ArgumentError: naming the argument.
-        UnfitStudentError: naming what the curriculum needs of the student, and how to give it.
+        UnfitStudentError: naming the function that the curriculum needs, and how to give it.
 
     Example:
         >>> import proposer_rl as prl
@@ -98,11 +105,11 @@ class Teacher:
         (['gravity', 'walls'], None)
     """
 
-    _block: Block | None  # that tickets are handed out from
-    _at: int  # the next of them
-    _counted: int  # the next that the log has not counted
-    _rows: list[Any]  # its levels one by one, from the first time on
-    _moved: Any  # its levels as the loop gets them, likewise
+    _block: Block | None  # whose tickets are being handed out
+    _at: int  # the next of these tickets
+    _counted: int  # the first of them that the log has not counted
+    _rows: list[Any]  # the block's levels one by one, once they were asked for
+    _moved: Any  # the block's levels on the loop's device, likewise
 
     @torch.inference_mode(False)
     @checked
@@ -114,7 +121,7 @@ class Teacher:
         seed: SupportsIndex = 0,
         device: str | torch.device = "cpu",
         filter: Mapping[str, Any] | str | None = None,
-        block: Count = 384,
+        block: Count | None = None,
         success: Success | None = None,
         student: Student | None = None,
         **can: Any,
@@ -124,37 +131,36 @@ class Teacher:
         self.id = token_hex(4)
         self._seed = whole("seed", seed)
         if hasattr(space, "space"):
-            self._like  # noqa: B018  what is wrong with one's own levels is told of these
+            self._like  # noqa: B018  so that errors in drawing levels come before others
         self.curriculum, self._made_of = make_curriculum(curriculum, space, filter, self._seed)
-        if student is not None and can:
-            raise ArgumentError(f"{next(iter(can))}: give it to the student, which is asked alone")
-        given = getattr(space, "given", lambda levels: levels)
+        given = self._given = getattr(space, "given", in_default_dtype)
+        self._rows_of = getattr(space, "rows", lambda levels: [*given(levels)])
+        self._success = success
         self.student = student or Student(
             **{name: adapted(name, one, given, self.device) for name, one in can.items()}
         )
         named = curriculum if isinstance(curriculum, str) else getattr(curriculum, "name", None)
         require(self.student, self.curriculum.needs, named or type(self.curriculum).__name__)
-        self._given, self._rows_of = given, getattr(space, "rows", list)
-        self._success = success
         kinds = {**dict.fromkeys(RESULTS, float), "rollout": object}
         self._ledger, self._tally = Ledger(kinds), Tally(space)
-        self._scored: bool | None = None  # whether results come with a score; None before any
-        self._succeeded: set[bool] = set()  # whether they came with a success, or without
+        self._scored: bool | None = None  # whether results have a score; None before any
+        self._with_success: bool | None = None  # whether they have a success, likewise
+        self._warned = False  # of a missing success
         self._proposals = self._levels_told = 0  # the latter up to the last log()
-        self._whole: list[int] = []  # first tickets of what propose() has given
+        self._whole: list[int] = []  # first tickets of the batches that propose() returned
         self._block, self._counted = None, 0
         self._use(None, 0)
-        self._kept: TensorDictBase | None = None  # steps [L] of episodes that have not ended
+        self._kept: TensorDictBase | None = None  # steps [L] of rollouts' unfinished episodes
         self._lock, self._process = RLock(), os.getpid()
         self._server: TeacherServer | None = None
 
     @property
     def required_results(self) -> tuple[str, ...]:
-        """Names of what results must have beside the return: ``success``, ``rollout``."""
+        """Returns what results must have beside the return: ``success``, ``rollout``."""
         return self.curriculum.required_results
 
     def propose(self, n: SupportsIndex) -> Any:
-        """Returns levels [n] to be observed together."""
+        """Returns levels [n], whose results :meth:`observe` takes together."""
         with self._here():
             block = self._next(whole("n", n, 1))
             block.state[:] = OUT
@@ -163,13 +169,14 @@ class Teacher:
             return self._levels(block)
 
     def ask(self, n: SupportsIndex | None = None) -> tuple[Any, Any]:
-        """Hands out the next level and its ticket.
+        """Returns the next level, or the next ``n``, with the tickets by which to tell results.
 
         Args:
-            n: None for one level, as Python's numbers where the space has such; else so many.
+            n: number of levels; None for a single one.
 
         Returns:
-            A ticket and a level; or tickets int64 [n] and levels [n], on the teacher's device.
+            Tickets int64 [n] and levels [n], on the teacher's device. For a single one a ticket and
+            a level, whose parameters are numbers and texts of Python's.
         """
         with self._here():
             if n is None:
@@ -205,43 +212,33 @@ class Teacher:
 
         Args:
             ids: a ticket, or tickets [n] in any order.
-            return_: undiscounted, of an episode on each level or a mean of several: a number, or
-                numbers [n].
-            success: whether, or of how many of them; from 0 to 1. It counts where all levels that
-                are observed together have one.
-            score: how much there is to learn on the level, where the loop says so itself, such as
-                the mean of its absolute advantages; for curricula that score levels. For all
-                levels of the teacher or for none.
-            episodes: how many there were; None for one. One number may stand for all tickets.
-            steps: how long they took together; likewise.
+            return_: undiscounted return of an episode on each level, or the mean of several: a
+                number, or numbers [n].
+            success: whether the episode was a success, or the share of several that were, from 0 to
+                1. Curricula use it where all levels that they observe together have one.
+            score: how much there is to learn on the level, if the loop computes that itself, such
+                as the mean of the absolute advantages; for curricula that score levels. Give it for
+                all levels or for none.
+            episodes: number of episodes on each level, or one number for all tickets; None for 1.
+            steps: number of steps that these took together, likewise.
 
         Raises:
-            ArgumentError: naming the argument: a ticket that is not out, a number that is missing
-                or not finite, another shape.
+            ArgumentError: naming the argument, for a ticket that is not out, a number that is
+                missing or not finite, or another shape.
         """
         given = (return_, success, score, episodes, steps)
         pairs = zip(RESULTS, given, strict=True)
-        results = {n: one for n, one in pairs if one is not None or n == "return"}
         with self._here():
-            self._require("rollout", False, "use observe(rollout)")
-            self._require("success", success is not None, "tell it with success=")
-            if type(ids) is int:
-                numbers = {name: as_result(name, value, ()) for name, value in results.items()}
-                self._check_score(results)
-                self._ledger.tell_one(ids, numbers)
-                self._tally.returned(1, numbers["return"], numbers.get("success"))
-            else:
-                self._tell(as_ids("ids", ids), results)
-            self._note_known(results)
+            self._tell(ids, {n: one for n, one in pairs if one is not None or n == "return"})
 
     def predicted(self, ids: Any) -> NDArray[np.float64] | None:
-        """Returns the success that the curriculum expected of levels when it proposed them.
+        """Returns the success that the curriculum predicted for levels when it proposed them.
 
         Args:
             ids: tickets [n] that are out.
 
         Returns:
-            [n]; None if it expects nothing.
+            [n]; None if the curriculum makes no predictions.
 
         Raises:
             ArgumentError: for a ticket that is not out.
@@ -256,16 +253,16 @@ class Teacher:
             return found
 
     def done_with(self, ids: Any) -> NDArray[np.bool_]:
-        """Returns of which tickets [n] the results have been told, or that were dropped, [n]."""
+        """Returns which tickets [n] were told or dropped, [n]."""
         with self._here():
             return np.isin(self._ledger.states(as_ids("ids", ids)), (RETURNED, OVER))
 
     def drop(self, ids: Any = None) -> None:
-        """Gives up levels of which no results will come, as of episodes that were cut off.
+        """Gives up levels that will have no results, such as those of interrupted episodes.
 
         Args:
-            ids: the tickets, of which some may be over or have been told; None for all that are
-                out, as where a resumed loop begins anew.
+            ids: tickets, some of which may have been told or dropped already; None for all that are
+                out, as where a resumed loop begins new episodes.
         """
         with self._here():
             if ids is None:
@@ -281,40 +278,38 @@ class Teacher:
 
     @torch.inference_mode(False)
     def observe(self, outcome: Any, ids: Any = None) -> None:
-        """Takes the outcome of the levels that were proposed, or of those of some tickets.
+        """Takes the results of proposed levels, or of the levels of some tickets.
 
         Args:
-            outcome: by name, ``return`` and where there is such a thing ``success``, [n]; as
-                :func:`~proposer_rl.curricula.outcome_of` makes it of a rollout [n, T] each row of
-                which began with a reset on its level. Or a rollout [*B, T] with ``level_id``, as
-                :class:`~proposer_rl.teaching.LevelTransform` puts it there: each episode that ends
-                in it is one on the level that it began on, wherever that was.
+            outcome: results by name, ``return`` and perhaps others of :meth:`tell`, each [n]. Or a
+                rollout [*B, T] with the ``level_id`` of a
+                :class:`~proposer_rl.teaching.LevelTransform`: each episode that ends in it counts
+                for the level that it began on, also in an earlier rollout. For a rollout [n, T]
+                each row of which begins with a reset on its level, give
+                :func:`outcome_of(rollout) <proposer_rl.curricula.outcome_of>`.
             ids: the tickets; None for the levels of :meth:`propose`, if one batch is out.
 
         Raises:
-            ArgumentError: see :meth:`tell`; if several batches are out, or a rollout does not say
-                which levels it is of.
+            ArgumentError: as of :meth:`tell`; if ``ids`` is None while several batches are out.
         """
         with self._here():
             if isinstance(outcome, TensorDictBase) and "next" in outcome.keys():
                 kept = self._kept
-                if kept is not None:  # of episodes that were not cut off since
+                if kept is not None:  # without episodes that were dropped since
                     states = self._ledger.states(as_ids("ids", kept[LEVEL_ID].reshape(-1)))
                     kept = kept[torch.from_numpy(states == OUT).to(kept[LEVEL_ID].device)]
                 tickets, whole, left = ended(outcome, kept)
                 if len(tickets):
-                    self._observe_rollout(tickets, whole)
+                    self._tell(tickets, results_of_rollout(whole, self._success))
                 self._kept = left
                 return
             tickets = self._proposed() if ids is None else as_ids("ids", ids)
             results = by_name(outcome)
             if "rollout" in results:
-                self._observe_rollout(tickets, results["rollout"])
-            else:
-                for name in ("rollout", "success"):
-                    self._require(name, name in results, "put it into the outcome")
-                self._tell(tickets, results)
-                self._note_known(results)
+                rollout = results["rollout"]
+                rollout = rollout[0] if rollout.ndim > 2 else rollout
+                results = results_of_rollout(rollout, self._success)
+            self._tell(tickets, results)
             if ids is None:
                 self._whole.clear()
 
@@ -322,16 +317,14 @@ class Teacher:
     def log(self, file: str | os.PathLike[str] | None = None) -> dict[str, Any]:
         """Returns what happened since the last call, and the curriculum's own log.
 
-        For every curriculum: how many levels were ``proposed``, ``told`` and ``dropped``, and are
-        ``out`` now; ``mean_return`` and ``mean_success`` of the results, None without any;
-        and ``drawn``, how many of the proposed levels there were in each bin of each parameter.
-        The curriculum's own entries leave out results since the last proposal, so that logs change
-        no curriculum.
+        For every curriculum: the numbers of levels that were ``proposed``, ``told`` and
+        ``dropped``, and that are ``out`` now; ``mean_return`` and ``mean_success`` of the results,
+        None without any; and ``drawn``, the number of proposed levels in each bin of each
+        parameter. The curriculum's own entries do not include results since the last proposal.
 
         Args:
-            file: JSON Lines to which it is added as a line, without levels, with the teacher's
-                ``id`` as ``teacher``, and with ``levels_told`` since it began, for ``bin/report``,
-                which draws each teacher by itself, and what goes on from an earlier state.
+            file: a file of JSON Lines to append a line to, for ``bin/report``. The line has the
+                teacher's ``id`` as ``teacher`` and ``levels_told`` since it began, but no levels.
 
         Raises:
             StorageError: if the file cannot be written.
@@ -349,7 +342,7 @@ class Teacher:
 
     @torch.inference_mode(False)
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that a resumed loop needs, with the tickets that are out."""
+        """Returns the state for a checkpoint, including the tickets that are out."""
         with self._here():
             kept = self._kept
             return {
@@ -368,12 +361,12 @@ class Teacher:
 
     @torch.inference_mode(False)
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts back what :meth:`state_dict` returned, on whichever device its tensors are.
+        """Loads what :meth:`state_dict` returned, whichever device its tensors are on.
 
         Raises:
-            ArgumentError: if it is of another space, curriculum or setting of it, naming what
-                differs, or tickets are out, as of environments that have begun; then nothing has
-                changed.
+            ArgumentError: if the state belongs to another space, curriculum or setting, naming what
+                differs; if levels of this teacher are out, as after environments have been reset.
+                The call then has no effect.
         """
         with self._here():
             state = tree_map_only(Tensor, Tensor.cpu, state)
@@ -381,9 +374,8 @@ class Teacher:
                 require_same(what, state["of"][what], now)
             if self._ledger.out:
                 raise ArgumentError(
-                    "state: levels of this teacher are out, whose tickets it has for others; "
-                    "load it before collectors and environments begin, or drop() them, and reset "
-                    "what plays them"
+                    "state: levels of this teacher are still out; load it before collectors and "
+                    "environments begin, or call drop() and reset the environments"
                 )
             self.id, self._levels_told = state["id"], state["levels_told"]
             self.curriculum.load_state_dict(state["curriculum"])
@@ -398,10 +390,10 @@ class Teacher:
             self._kept = None if kept is None else TensorDict.from_dict(dict(kept), batch_dims=1)
 
     def diverge(self, number: int) -> None:
-        """Makes this teacher propose other levels, from the next one on, than its copies do.
+        """Makes this teacher draw other levels, from the next one on, than its copies do.
 
-        Each of several processes that made or loaded the same teacher calls it with a number of
-        its own, such as its rank. With 0 nothing changes.
+        Call it in each of several processes that made or loaded the same teacher, with a number of
+        its own, such as its rank. 0 changes nothing.
         """
         with self._here():
             if number:
@@ -412,19 +404,19 @@ class Teacher:
 
     @cached_property
     def _like(self) -> Levels:
-        """One level of the space."""
+        """Returns one level of the space."""
         source: Any = self.space.space
         return source.sample(1, torch.Generator())[0]
 
     @cached_property
     def _of(self) -> dict[str, Any]:
-        """The space and the curriculum that a state belongs to."""
+        """Describes the space and the curriculum that a state belongs to."""
         return {"space": of_levels(self.space, self._like), "curriculum": self._made_of}
 
     def client(self) -> TeacherClient:
-        """Returns a client of this teacher for another process, such as a collector's worker.
+        """Returns a client to send to another process, such as a collector's worker.
 
-        It has ``ask``, ``tell`` and ``drop``, and can be sent there.
+        It has ``ask``, ``tell`` and ``drop``.
         """
         with self._here():
             self._server = self._server or TeacherServer(self)
@@ -432,15 +424,14 @@ class Teacher:
 
     def __reduce__(self) -> Any:
         raise TypeError(
-            "a teacher is not copied into another process, where it would be a second one; give "
-            "that process teacher.client()"
+            "a teacher cannot be copied into another process, where it would be a second one; send "
+            "teacher.client() instead"
         )
 
     def _here(self) -> RLock:
         if os.getpid() != self._process:
             raise RuntimeError(
-                "this is a copy of a teacher that a forked process has; give that process "
-                "teacher.client()"
+                "this is a forked process's copy of a teacher; give that process teacher.client()"
             )
         return self._lock
 
@@ -453,21 +444,23 @@ class Teacher:
         return ticket, self._rows[ticket - block.start]
 
     def _current(self, left: int) -> Block:
-        """Returns the block of the next of ``left`` tickets, a new one if the last is used up."""
+        """Returns the block of the next ``left`` tickets, a new one if the last is used up."""
         block = self._block
         if block is None or (left and self._at == block.end):
-            block = self._next(max(self.block, left))
+            # Bounded, since a loop may lose tickets, which then stay out.
+            fitting = min(max(self._ledger.out + left, LEAST_BLOCK), LARGEST_BLOCK)
+            block = self._next(max(self.block or fitting, left))
             self._use(block, block.start)
         return block
 
     def _use(self, block: Block | None, at: int) -> None:
-        """Begins to hand out the tickets of a block, from ``at`` on."""
+        """Switches to a block, whose tickets are handed out from ``at`` on."""
         self._count()
         self._block, self._at, self._counted = block, at, at
         self._rows, self._moved = [], None
 
     def _count(self) -> None:
-        """Counts for the log what of the block was handed out."""
+        """Counts for the log which levels of the block were handed out."""
         block = self._block
         if block is not None and self._at > self._counted:
             some = slice(self._counted - block.start, self._at - block.start)
@@ -476,7 +469,7 @@ class Teacher:
 
     @torch.inference_mode(False)
     def _next(self, count: int) -> Block:
-        """Lets the curriculum observe the results there are, and returns what it then proposes."""
+        """Lets the curriculum observe the results that came, and returns its next proposal."""
         check_torch_defaults()
         for batch, results in self._ledger.take():
             self.curriculum.observe(self.student, batch, _outcome(results))
@@ -486,66 +479,49 @@ class Teacher:
         return self._ledger.add(batch)
 
     def _levels(self, block: Block) -> Any:
-        """Returns the levels of a block as the loop gets them, which may change them."""
+        """Returns a copy of a block's levels as the loop gets them."""
         return self._given(moved(block.batch.levels, self.device).clone())
 
-    def _tell(self, ids: NDArray[np.int64], results: Mapping[str, Any]) -> None:
-        arrays = {name: as_result(name, value, (len(ids),)) for name, value in results.items()}
-        self._check_score(results)
-        self._ledger.tell(self._ledger.find(ids), arrays)
-        self._tally.returned(len(ids), arrays["return"], arrays.get("success"))
-
-    def _observe_rollout(self, ids: NDArray[np.int64], rollout: TensorDictBase) -> None:
-        """Notes what came of a rollout [n, T] or [1, n, T], with a row for each ticket."""
-        rollout = rollout[0] if rollout.ndim > 2 else rollout
-        if len(rollout) != len(ids):
-            raise ArgumentError(
-                f"rollout: has shape {list(rollout.batch_size)}, but must have a row for each of "
-                f"{len(ids)} levels"
-            )
-        outcome = outcome_of_rollout(rollout, self._success)
-        known = "success" in outcome.keys()
-        self._require("success", known, "give Teacher(success=...), or the rollout a next success")
-        results: dict[str, NDArray[Any]] = {
-            name: as_result(name, outcome[name], (len(ids),))
-            for name in (("return", "success") if known else ("return",))
-        }
-        results["rollout"] = np.empty(len(ids), object)
-        results["rollout"][:] = outcome["rollout"].unbind(0)
-        self._ledger.tell(self._ledger.find(ids), results)
-        self._tally.returned(len(ids), results["return"], results.get("success"))
-
-    def _check_score(self, results: Mapping[str, Any]) -> None:
-        if self._scored not in (None, "score" in results):
+    def _tell(self, ids: Any, given: Mapping[str, Any]) -> None:
+        """Notes the results of a ticket or of tickets [n], and warns once of a missing success."""
+        for name in self.required_results:
+            if name not in given:
+                raise ArgumentError(f"{name}: missing: this curriculum requires it; {HOW[name]}")
+        single = type(ids) is int
+        tickets = np.array([ids]) if single else as_ids("ids", ids)
+        shape = () if single else (len(tickets),)
+        results = {name: as_result(name, value, shape) for name, value in given.items()}
+        scored, known = "score" in results, "success" in results
+        if self._scored not in (None, scored):
             how = "missing: other levels were told with one" if self._scored else "others had none"
             raise ArgumentError(f"score: {how}; give it for all or for none")
-
-    def _note_known(self, results: Mapping[str, Any]) -> None:
-        """Notes what came beside returns, and warns, once, of success for some levels alone."""
-        self._scored, known = "score" in results, "success" in results
-        if known not in self._succeeded:
-            self._succeeded.add(known)
-            if len(self._succeeded) == 2:
-                warnings.warn(
-                    "success: told of some levels alone; curricula read it only where all levels "
-                    "that they observe together have one, and mean_success is of those that have; "
-                    "tell it of failures, too",
-                    stacklevel=3,
-                )
-
-    def _require(self, name: str, known: bool, how: str) -> None:
-        if name in self.required_results and not known:
-            raise ArgumentError(f"{name}: missing: this curriculum reads it; {how}")
+        if single:
+            self._ledger.tell_one(ids, results)
+        else:
+            self._ledger.tell(self._ledger.find(tickets), results)
+        self._tally.returned(len(tickets), results["return"], results.get("success"))
+        self._scored = scored
+        if self._warned:
+            return
+        if not known and "success" in self.curriculum.optional_results:
+            missing = "missing: this curriculum learns more from success than from returns"
+        elif self._with_success not in (None, known):
+            missing = "told of some levels only, where curricula ignore it"
+        else:
+            self._with_success = known
+            return
+        self._warned = True
+        warnings.warn(f"success: {missing}; {HOW['success']}", stacklevel=3)
 
     def _proposed(self) -> NDArray[np.int64]:
-        """Returns the tickets of the one batch that is out."""
+        """Returns the tickets of the only batch that is out."""
         whole = [block for block in self._ledger.blocks if block.start in self._whole]
         out = [block for block in whole if (block.state == OUT).any()]
         if len(out) != 1:
             how = f"{len(out)} batches are out" if out else "nothing is out"
             raise ArgumentError(
-                f"ids: missing: {how}; observe belongs to the last propose, and several at once "
-                "need ask(n) and its tickets"
+                f"ids: missing: {how}; without tickets observe() takes the results of the last "
+                "propose(); for several batches at once use ask(n) and its tickets"
             )
         return np.arange(out[0].start, out[0].end)
 

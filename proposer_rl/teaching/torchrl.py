@@ -23,20 +23,20 @@ from proposer_rl.teaching.remote import TeacherClient
 from proposer_rl.teaching.results import LEVEL_ID
 from proposer_rl.teaching.teacher import Success, Teacher
 
-NONE = -1  # the identity of no level
+NONE = -1  # the ticket of no level
 
 
 class _Played:
-    """The levels [n] that the environments of a batch play, and what has come of them so far."""
+    """The levels [n] that the environments of a batch play, and their results so far."""
 
-    owners: Sequence[object] = ()  # those of the transforms there were, the present one last
+    owners: Sequence[object] = ()  # of the transforms that there were, the present one last
     ids: Tensor  # int64 [n]
-    out: Tensor  # whether they still are, bool [n]
+    out: Tensor  # whether an episode on the level goes on, bool [n]
     returns: Tensor
     steps: Tensor
     succeeded: Tensor
-    knows: bool  # whether there is such a thing
-    levels: Any = None  # [n], in one row
+    knows: bool  # whether anything says what a success is
+    levels: Any = None  # [n], without the batch's other dimensions
     asked = False
 
     def __reduce__(self) -> Any:
@@ -44,37 +44,35 @@ class _Played:
 
 
 class LevelTransform(Transform):
-    """Asks a teacher for a level at every reset, and reports every episode.
+    """Asks a teacher for a level at every reset, and tells it the result of every episode.
 
-    Resets may be of some environments of a batch. ``level_id``, in every step, is the ticket of the
-    level that is played. An episode goes to the level that it began on, in whichever rollout it
-    ends. One that a full reset cuts off counts for nothing.
+    Some environments of a batch may be reset while others go on. ``level_id``, in every step, is
+    the ticket of the level that is played: an episode counts for the level that it began on, in
+    whichever rollout it ends. An episode that a full reset cuts off is dropped.
 
-    An environment has one ``LevelTransform``: a second one around it is refused, and one around its
-    ``base_env`` takes the place of the first.
+    An environment has one ``LevelTransform``: a second one around it is refused, and a new one
+    around its ``base_env`` replaces the first.
 
-    It works in a collector with and without ``reset_at_each_iter``, and with ``teacher.client()``
+    It works in collectors with and without ``reset_at_each_iter``, and with ``teacher.client()``
     in environments of other processes. Put it behind transforms that end episodes and before those
     that change rewards.
 
     Args:
-        teacher: in another process than its own, its client.
+        teacher: the teacher, or in another process its client.
         set_level: ``set_level(env, levels)`` makes the environment, without transforms, play levels
-            [*B] from its next reset on. Of those that go on the levels are as before.
-        success: see :class:`Teacher`, or another entry of ``next``; None for its entry
-            ``success``, or what the environment's class has as ``success_rule``.
-        once: whether it may be one in any step, so that what is reached and lost again counts.
-        reward: the entry of ``next`` that returns are of, one number for each environment; or a
-            function of ``next`` that makes it of several agents' or objectives'.
-        tell: whether it reports returns and success; False where the loop gives whole rollouts to
-            :meth:`Teacher.observe`. A collector with ``set_truncated``, which ends episodes in a
-            rollout alone, then needs ``reset_at_each_iter``.
+            [*B] from its next reset on; for environments that are not reset they are as before.
+        success: as of :class:`Teacher`, or another entry of ``next``; None for its entry
+            ``success``, or the ``success_rule`` of the environment's class.
+        once: whether an episode is a success if any of its steps was, not only the last.
+        reward: the entry of ``next`` that returns are sums of, a number for each environment; or a
+            function of ``next`` that makes one of the rewards of several agents or objectives.
+        tell: whether it tells return and success; False where the loop gives whole rollouts to
+            :meth:`Teacher.observe`. A collector with ``set_truncated``, which ends episodes only
+            in the rollout, then needs ``reset_at_each_iter``.
 
     Raises:
-        ArgumentError: if the teacher reads rollouts while ``tell`` is true; at the first reset, if
-            the environment has a ``LevelTransform`` or no such reward or success, resets itself, or
-            is one of several that levels do not get into from outside; later, if another
-            ``LevelTransform`` has taken this one's place.
+        ArgumentError: at the first reset, if the environment has a ``LevelTransform``, resets
+            itself, or is a ``ParallelEnv`` or ``SerialEnv``; later, if another one has replaced it.
     """
 
     def __init__(
@@ -88,28 +86,19 @@ class LevelTransform(Transform):
         tell: bool = True,
     ) -> None:
         super().__init__(in_keys=[], out_keys=[LEVEL_ID])
-        if tell and "rollout" in teacher.required_results:
-            raise ArgumentError(
-                "tell=True: this curriculum reads rollouts; give tell=False, and each rollout to "
-                "teacher.observe"
-            )
         self._teacher, self._set_level, self._own = teacher, set_level, object()
         self._rule, self._once, self._reward, self._tells = success, once, reward, tell
 
     @property
     def _now(self) -> _Played:
-        # The environment's: of a transform that another one steps through TorchRL makes a clone.
+        # Kept by the environment, since TorchRL clones transforms that another one steps through.
         place = vars(self.parent.base_env)
         played: _Played = place.get("_played", _Played())
         if self._own not in played.owners[-1:]:
-            if LEVEL_ID in self.parent.observation_spec.keys():
+            if LEVEL_ID in self.parent.observation_spec.keys() or self._own in played.owners:
                 raise ArgumentError(
-                    "env: has a LevelTransform already, as where a cell is run twice: each would "
-                    "set a level of its own; make the environment anew, or give env.base_env"
-                )
-            if self._own in played.owners:
-                raise ArgumentError(
-                    "env: another LevelTransform has been put around it since; use that"
+                    "env: has another LevelTransform, as happens when a cell is run twice; make "
+                    "the environment anew, or wrap env.base_env and use only the new one"
                 )
             before, played = played, _Played()
             played.owners = [*before.owners, self._own]
@@ -138,15 +127,18 @@ class LevelTransform(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         after, now = next_tensordict, self._now
-        now.returns += self._of_each("reward", self._reward, after)
+        now.returns += self._of_each(self._reward, after)
         now.steps += 1
-        rule = self._success(after)
+        rule = self._rule
+        if rule is None:
+            own_rule = getattr(type(self.parent.base_env), "success_rule", None)
+            rule = "success" if "success" in after.keys() else own_rule
         now.knows = rule is not None
         if rule is not None:
-            success = self._of_each("success", rule, after)
-            # It is written to.
+            success = self._of_each(rule, after)
+            # A copy, as resets write to it.
             now.succeeded = now.succeeded.maximum(success) if self._once else success.clone()
-        self._end(self._of_each("done", "done", after) & now.out)
+        self._end(self._of_each("done", after) & now.out)
         return self._marked(after)
 
     def _begin(self, tensordict: TensorDictBase | None) -> None:
@@ -160,7 +152,7 @@ class LevelTransform(Transform):
             self._start(count, device)
             which = torch.arange(count, device=device)
         else:
-            # What has not ended here ended by a transform behind this one.
+            # Episodes that have not ended here were ended by a transform behind this one.
             self._end(mask.reshape(-1) & now.out)
             which = mask.reshape(-1).nonzero().squeeze(-1)
         ids, levels = self._teacher.ask(len(which))
@@ -179,19 +171,17 @@ class LevelTransform(Transform):
         if isinstance(env, ParallelEnv | SerialEnv):
             name = type(env).__name__
             raise ArgumentError(
-                f"env: levels do not get into the environments of {name} from outside; give each "
-                f"a transform, as in {name}(n, make), where make returns TransformedEnv(env, "
+                f"env: set_level cannot reach the environments inside {name}; give each its own "
+                f"transform, as in {name}(n, make), where make returns TransformedEnv(env, "
                 "LevelTransform(client, set_level)) with client = teacher.client()"
             )
         resets_itself = VecGymEnvTransform, AutoResetTransform
         if any(isinstance(part, resets_itself) for part in self.parent.modules()):
             raise ArgumentError(
-                "env: resets itself at an episode's end, before there is another level; give a "
-                "vector of Gymnasium autoreset_mode=AutoresetMode.DISABLED"
+                "env: resets itself at the end of an episode, before the next level is set; make "
+                "a vector environment with autoreset_mode=AutoresetMode.DISABLED"
             )
-        if now.levels is None:
-            self._check()
-        elif bool(now.out.any()):
+        if now.levels is not None and bool(now.out.any()):
             self._teacher.drop(now.ids[now.out])
         now.ids = torch.full((count,), NONE, device=device)
         now.returns = torch.zeros(count, dtype=torch.float64, device=device)
@@ -199,18 +189,10 @@ class LevelTransform(Transform):
         now.out = torch.zeros(count, dtype=torch.bool, device=device)
         now.succeeded = torch.zeros_like(now.out)
 
-    def _check(self) -> None:
-        """Refuses what a step will lack, before there is one."""
-        after = self.parent.fake_tensordict()["next"]
-        self._of_each("done", "done", after)
-        for name, rule in (("reward", self._reward), ("success", self._success(after))):
-            if rule is not None and not callable(rule):
-                self._of_each(name, rule, after)
-
     def _end(self, ended: Tensor) -> None:
-        """Reports the episodes of the environments where one has ended, bool [n]."""
+        """Tells the results of the environments whose episodes have ended, bool [n]."""
         now = self._now
-        which = ended.nonzero().squeeze(-1)  # waits for the device once, where each mask would
+        which = ended.nonzero().squeeze(-1)  # waits for the device once, not for every mask
         if self._tells and len(which):
             self._teacher.tell(
                 now.ids[which],
@@ -220,30 +202,10 @@ class LevelTransform(Transform):
             )
         now.out = now.out & ~ended
 
-    def _of_each(self, name: str, rule: Any, after: TensorDictBase) -> Tensor:
-        """Returns one number of each environment, [n], by an entry or a function."""
-        entry = rule(after) if callable(rule) else after[rule]
-        batch = self.parent.batch_size
-        if entry.numel() != batch.numel() or entry.shape[: len(batch)] != batch:
-            raise ArgumentError(
-                f"{name}: has the shape {[*entry.shape]}, not {[*batch, 1]}; it must be "
-                "one number for each environment, an entry or a function of next"
-            )
-        return entry.reshape(-1)
-
-    def _success(self, after: TensorDictBase) -> Any:
-        """Returns the entry or function that says what is a success; None where nothing does."""
-        if self._rule is not None:
-            return self._rule
-        if "success" in after.keys():
-            return "success"
-        rule = getattr(type(self.parent.base_env), "success_rule", None)
-        if rule is None and self._tells and "success" in self._teacher.required_results:
-            raise ArgumentError(
-                "success: missing: this curriculum reads it, and the environment has no such "
-                'entry; give success="terminated", "truncated" or a function'
-            )
-        return rule
+    def _of_each(self, rule: Any, after: TensorDictBase) -> Tensor:
+        """Returns a number for each environment, [n], by an entry or a function of ``next``."""
+        entry: Tensor = rule(after) if callable(rule) else after[rule]
+        return entry.reshape(self.parent.batch_size.numel())
 
     def _marked(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.set(LEVEL_ID, self._now.ids.reshape(*tensordict.batch_size, 1).clone())

@@ -1,4 +1,4 @@
-"""A curriculum of prompts in TRL's GRPOTrainer, whose rewards are its results."""
+"""A curriculum of prompts in TRL's GRPOTrainer, which learns from the rewards."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from transformers import TrainerCallback
 
 from proposer_rl.runs.folder import write_atomically
 from proposer_rl.settings import ArgumentError
-from proposer_rl.teaching.sampler import TeacherSampler, items_of
+from proposer_rl.teaching.sampler import TeacherSampler
 from proposer_rl.teaching.teacher import Teacher
 
-ROW = "teacher_item"  # the column of the training set that says which row it is
-FILE = "teacher.pt"  # of a checkpoint
+ROW = "teacher_item"  # the column of the training set that numbers its rows
+FILE = "teacher.pt"  # in a checkpoint
 
 
 class TaughtReward(TrainerCallback):
-    """A reward function that reports to a teacher, which draws the trainer's prompts.
+    """Lets a teacher draw a trainer's prompts, and tells it the rewards of a reward function.
 
         reward = TaughtReward(teacher, solved)
         trainer = GRPOTrainer(model, reward, config, rows)
@@ -29,18 +29,16 @@ class TaughtReward(TrainerCallback):
         trainer.train()
 
     Groups and their repetitions follow from the trainer's config; an epoch has as many prompts as
-    the training set. Evaluation does not count. Checkpoints hold the curriculum, and
-    ``train(resume_from_checkpoint=...)`` goes on with it. In a launch each rank does the same.
-    The trainer logs :meth:`TeacherSampler.metrics` as ``curriculum/...``.
+    the training set has rows. Evaluation has no effect. Checkpoints hold the curriculum,
+    and ``train(resume_from_checkpoint=...)`` goes on with it. In a launch of several ranks, write
+    the same on each. The trainer logs :meth:`TeacherSampler.metrics` as ``curriculum/...``.
 
     Args:
-        teacher: of :class:`Items`, one for each row of the training set.
-        reward: a function, no coroutine, of completions and columns, as TRL calls it: of each how
-            well it solves its prompt, from 0 to 1; None for one that does not count.
-        source: the column of the training set by which metrics are logged, too; None for none.
-
-    Raises:
-        ArgumentError: if the teacher's levels are no items of one student.
+        teacher: a teacher of :class:`Items`, one for each row of the training set.
+        reward: a function of completions and columns, as TRL calls it, but no coroutine, that
+            returns how well each completion solves its prompt, from 0 to 1; None for a completion
+            that does not count.
+        source: the column of the training set by which metrics are also logged; None for none.
     """
 
     _trainer: Any = None
@@ -54,23 +52,24 @@ class TaughtReward(TrainerCallback):
         reward: Callable[..., Sequence[float | None]],
         source: str | None = None,
     ) -> None:
-        self._teacher, self._rows, self._reward = teacher, items_of(teacher).size, reward
+        space: Any = teacher.space
+        self._teacher, self._rows, self._reward = teacher, space.size, reward
         self._source = source
-        self._told = 0  # generations
-        self._again = False  # whether the next one repeats the last that was reported
+        self._told = 0  # number of generations
+        self._again = False  # whether the next one repeats the last that was told
         update_wrapper(self, reward)  # TRL logs it by its name
 
     def attach(self, trainer: Any) -> None:
-        """Makes the teacher draw the prompts of a trainer, before that trains.
+        """Makes the teacher draw a trainer's prompts; call it before training.
 
         Args:
-            trainer: ``GRPOTrainer`` or another that generates groups as that does.
+            trainer: ``GRPOTrainer``, or another trainer that generates groups in the same way.
 
         Raises:
-            ArgumentError: naming what of the trainer does not fit.
+            ArgumentError: naming what does not fit in the trainer.
         """
         if self not in trainer.reward_funcs:
-            raise ArgumentError("reward_funcs: must have this TaughtReward, which reports results")
+            raise ArgumentError("reward_funcs: must contain this TaughtReward, which tells results")
         rows, config = trainer.train_dataset, trainer.args
         count = f"{len(rows)} rows" if hasattr(rows, "__len__") else "a stream"
         if count != f"{self._rows} rows":
@@ -99,15 +98,13 @@ class TaughtReward(TrainerCallback):
         trainer.add_callback(self)
 
     def _taught_dataloader(self) -> Any:
-        """Returns the trainer's loader, of items that the teacher draws."""
+        """Returns the trainer's loader, with the items that the teacher draws."""
         loader = self._loader()
-        loader.set_sampler(self._sampler)  # as loaders that accelerate has prepared can
+        loader.set_sampler(self._sampler)  # a method of loaders that accelerate prepared
         return loader
 
     def __call__(self, completions: Sequence[Any], **columns: Any) -> Sequence[float | None]:
-        """Returns the rewards; while the model trains, the teacher gets them as results."""
-        if self._trainer is None:
-            raise ArgumentError("trainer: missing: call attach(trainer) before it trains")
+        """Returns the rewards; during training it also tells them to the teacher."""
         items = columns.pop(ROW, None)  # none in evaluation
         rewards = self._reward(completions=completions, **columns)
         if self._trainer.model.training:
@@ -121,29 +118,29 @@ class TaughtReward(TrainerCallback):
         return rewards
 
     def load(self, folder: str | Path) -> None:
-        """Loads the curriculum of a checkpoint that does not lie in the config's output_dir."""
+        """Loads the curriculum of a checkpoint that is not in the config's output_dir."""
         state = torch.load(Path(folder) / FILE, weights_only=True)
         self._teacher.load_state_dict(state["teacher"])
         self._sampler.load_state_dict(state["sampler"])
-        self._sampler.rewind()  # the trainer skips what it has had
+        self._sampler.rewind()  # since the trainer skips the batches that it has had
         self._told, self._loaded = state["told"], True
 
     def on_train_begin(self, args: Any, state: Any, control: Any, **_: Any) -> None:
         """Loads the curriculum of the step at which training is resumed."""
-        if not state.global_step:  # nothing comes of what an earlier training has drawn ahead
+        if not state.global_step:  # items that an earlier training drew ahead have no results
             self._sampler.drop()
             self._told, self._loaded = 0, False
             return
         if not self._loaded:
             self.load(Path(args.output_dir) / f"checkpoint-{state.global_step}")
         self._loaded = False
-        # Within the steps of a generation TRL generates again, of prompts whose rewards it has.
+        # Resumed within the steps of a generation, TRL generates it again, though it was told.
         per_step = args.gradient_accumulation_steps
         epoch, step = divmod(state.global_step, -(-self._groups * self._rounds // per_step))
         self._again = self._told > epoch * self._groups + step * per_step // self._rounds
 
     def on_save(self, args: Any, state: Any, control: Any, **_: Any) -> None:
-        """Puts the curriculum into the checkpoint; that of all ranks is the same."""
+        """Adds the curriculum to the checkpoint; it is the same on all ranks."""
         if args.should_save:
             made = {
                 "teacher": self._teacher.state_dict(),

@@ -175,7 +175,7 @@ def _config(environment: str, seeds: Sequence[int], frames: int, episodes: int) 
     updates = -(-frames // (count * solver["ppo"]["horizon"]))
     own = {"task": task, "solver": {"batch_size": count, "ppo": solver["ppo"]}}
     more = {"seeds": [*seeds], "schedule": {"updates": updates}}
-    return read_config(composed(["task=gymnasium", "+method=target"], own, more))
+    return read_config(composed(["task=gymnasium", "method=target"], own, more))
 
 
 def _compared(rows: Sequence[Trained]) -> Result:

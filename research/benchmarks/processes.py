@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from proposer_rl.models import available_cores
-from proposer_rl.tasks.gymnasium.answers import SuccessSettings
 from proposer_rl.tasks.gymnasium.batched_env import GymnasiumEnv, Vectorization
+from proposer_rl.tasks.gymnasium.environment import SuccessSettings
 from proposer_rl.tasks.gymnasium.player import MakeEnvironment
 from proposer_rl.tasks.parameters import ParameterSpace
 from research.benchmarks.environment import through_torchrl

@@ -23,7 +23,7 @@ from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 from proposer_rl.tasks.mazes import Level, SpecificationSpace
-from proposer_rl.tasks.mazes.distributions import LevelDistribution
+from proposer_rl.tasks.mazes.generation import LevelDistribution
 from tests.curricula.living import TASK, live, solvers, student
 from tests.curricula.made import filtered, paired
 from tests.curricula.scripted import GivenScores

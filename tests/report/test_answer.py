@@ -5,12 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from proposer_rl.report import page
 from proposer_rl.report.comparisons import UNDECIDED
 from proposer_rl.report.outcomes import answer, comparison_table, first_rows, meaning
 from proposer_rl.report.studies import Study, read_studies
@@ -137,6 +139,18 @@ def test_p_is_corrected_for_the_comparisons_that_were_planned(tmp_path: Path) ->
     assert row["p (Holm)"] == pytest.approx(alone["b"])
     # Of two others the last is the baseline.
     assert replace(study, planned=("a", "c")).baseline.label == "c"
+
+
+@pytest.mark.parametrize("other", [0.2, 3e-5, -0.4])
+def test_the_numbers_above_the_dots_do_not_overlap(tmp_path: Path, other: float) -> None:
+    """A character is at most 7 pixels wide in its font of 11."""
+    ends = {"a": 0.5 + other, "b": 0.49, "domain_randomization": 0.5}
+    study = study_of(tmp_path, ends, noise=0.0)
+    first = page.first(page.first_of_study(study), first_rows(study), [], ())
+    spans = sorted((x - 3.2 * len(t), x + 3.2 * len(t)) for x, t in first["ticks"])
+    assert "0" in dict(map(reversed, first["ticks"])) and len(spans) > 1
+    assert spans[0][0] >= 0 and spans[-1][1] <= first["wide"]
+    assert all(one[1] < other[0] for one, other in pairwise(spans))
 
 
 def test_few_seeds_decide_nothing(tmp_path: Path) -> None:

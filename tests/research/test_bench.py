@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from proposer_rl.report.publish import publish
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import MazeEnv, generate_levels
 from research.benchmarks import worker
@@ -30,7 +31,6 @@ from research.benchmarks.report import number, summary
 from research.benchmarks.results import Options, Result, Row, Spread
 from research.benchmarks.scales import PAPER, QUICK, TINY, Solvers
 from research.benchmarks.timing import interleave, ratio, threads
-from research.publish import publish
 from research.timing import read_timing
 from tests.commands import call
 from tests.report.folders import write_run
@@ -128,7 +128,7 @@ def test_bad_input_is_told_in_one_line(bench, capsys, arguments, message) -> Non
 def test_methods_of_runs_are_timed_in_turns(
     bench, train, capsys, monkeypatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("research.publish.write_page", lambda _: None)  # its pictures
+    monkeypatch.setattr("proposer_rl.report.publish.write_page", lambda *_: None)  # its pictures
     for method in ("domain_randomization", "perf_gain"):
         few = ["+scale=smoke", "schedule.updates=1"]
         assert train(f"+method={method}", *few, f"hydra.run.dir=runs/{method}") == 0

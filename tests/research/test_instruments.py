@@ -93,4 +93,4 @@ def test_look_refuses_a_run_without_a_proposer(tmp_path: Path, capsys) -> None:
     assert call(train, "+method=target", *SMOKE, f"hydra.run.dir={folder}") == 0
     capsys.readouterr()
     assert call(look, str(folder), str(folder)) == 2
-    assert "holds no Proposer" in capsys.readouterr().err
+    assert "belongs to another network" in capsys.readouterr().err

@@ -4,7 +4,6 @@ import hashlib
 import io
 import json
 import logging
-import math
 import os
 import pickle
 from collections.abc import Callable
@@ -31,37 +30,22 @@ def _names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_training_state_comes_back_and_goes_on(tmp_path: Path) -> None:
-    def step() -> torch.Tensor:
-        optimizer.zero_grad()
-        loss = net(torch.rand(3, 4)).square().mean()
-        loss.backward()
-        optimizer.step()
-        return loss.detach()
-
-    net = torch.nn.Linear(4, 2)
-    optimizer = torch.optim.Adam(net.parameters(), lr=0.1)
-    step()
+def test_a_state_comes_back(tmp_path: Path) -> None:
+    """That a training goes on from it to the bit, ``tests/test_kill.py`` shows."""
+    optimizer = torch.optim.Adam([weight := torch.nn.Parameter(torch.ones(2))])
+    weight.sum().backward()
+    optimizer.step()
     state = {
-        "net": net.state_dict(),
         "optimizer": optimizer.state_dict(),
         "rng": torch.get_rng_state(),
-        "lengths": {"metrics.csv": 3},
         "misc": [1, 0.1, True, None, "text", ("a", float("inf"))],
     }
     save_checkpoint(tmp_path, 7, state)
-    expected = [step() for _ in range(3)]
-
-    loaded = load_latest(tmp_path)
-    assert loaded is not None
-    number, state = loaded
-    assert number == 7
-    assert state["misc"] == [1, 0.1, True, None, "text", ("a", float("inf"))]
-    assert state["lengths"] == {"metrics.csv": 3}
-    net.load_state_dict(state["net"])
-    optimizer.load_state_dict(state["optimizer"])
-    torch.set_rng_state(state["rng"])
-    assert [step() for _ in range(3)] == expected
+    number, loaded = load_latest(tmp_path) or (0, {})
+    assert number == 7 and loaded["misc"] == state["misc"]
+    assert torch.equal(loaded["rng"], torch.get_rng_state())
+    optimizer.load_state_dict(loaded["optimizer"])
+    assert str(optimizer.state_dict()) == str(state["optimizer"])
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.int64, torch.bool])
@@ -90,35 +74,27 @@ def test_plain_torch_can_read_what_follows_the_two_lines(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("state", "message"),
     [
-        ((1, {"a": [object()]}), r"state\['a'\]\[0\] is a object"),
-        ((1, {"a": np.float64(1)}), r"state\['a'\] is a float64"),
-        ((1, {"a": {np.int64(1): 2}}), r"a key of state\['a'\] is a int64"),
-        ((1, {"a": Path("x")}), r"state\['a'\] is a PosixPath"),
+        ({"a": [object()]}, r"state\['a'\]\[0\] is a object"),
+        ({"a": {np.int64(1): 2}}, r"a key of state\['a'\] is a int64"),
     ],
 )
 def test_refuses_to_save_what_could_not_be_loaded(
-    tmp_path: Path, arguments: tuple[Any, ...], message: str
+    tmp_path: Path, state: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(CheckpointError, match=message):
-        save_checkpoint(tmp_path, *arguments)
+        save_checkpoint(tmp_path, 1, state)
     assert _names(tmp_path) == []
 
 
 def test_keeps_the_newest(tmp_path: Path) -> None:
     folder = tmp_path / "run" / "checkpoints"
     # The last one has more digits than the name is padded to.
-    for step in (1, 2, 10, 1_000_000_000):
+    for step in (1, 2, 10, 10, 1_000_000_000):
         save_checkpoint(folder, step, {"step": step}, keep=2)
     assert _names(folder) == ["step_000000010.pt", "step_1000000000.pt"]
     assert load_latest(folder) == (1_000_000_000, {"step": 1_000_000_000})
-
-
-def test_the_same_step_is_replaced(tmp_path: Path) -> None:
-    save_checkpoint(tmp_path, 1, {"x": 1})
-    save_checkpoint(tmp_path, 1, {"x": 2})
-    assert load_latest(tmp_path) == (1, {"x": 2})
 
 
 def test_nothing_to_load(tmp_path: Path) -> None:
@@ -129,25 +105,16 @@ def test_nothing_to_load(tmp_path: Path) -> None:
         load_checkpoint(tmp_path / "none.pt")
 
 
-DAMAGES: dict[str, Callable[[bytes], bytes]] = {
-    "empty": lambda content: b"",
-    "truncated": lambda content: content[:-1],
-    "half": lambda content: content[: len(content) // 2],
-    "longer": lambda content: content + b"\0",
-    "foreign": lambda content: b"something else\n",
-}
+def _damage(path: Path, bytes_left: int = -1) -> None:
+    path.write_bytes(path.read_bytes()[:bytes_left])
 
 
-def _damage(path: Path, how: str = "half") -> None:
-    path.write_bytes(DAMAGES[how](path.read_bytes()))
-
-
-@pytest.mark.parametrize("how", DAMAGES)
+@pytest.mark.parametrize("bytes_left", [0, 100, -1])
 def test_falls_back_to_the_one_before(
-    tmp_path: Path, how: str, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, bytes_left: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     save_checkpoint(tmp_path, 1, {"x": 1})
-    _damage(save_checkpoint(tmp_path, 2, {"x": 2}), how)
+    _damage(save_checkpoint(tmp_path, 2, {"x": 2}), bytes_left)
     with caplog.at_level(logging.WARNING):
         assert load_latest(tmp_path) == (1, {"x": 1})
     (said,) = caplog.messages
@@ -208,9 +175,7 @@ def _saved(value: object) -> bytes:
 NOW = {"format": FORMAT, "step": 2}
 
 
-@pytest.mark.parametrize(
-    "header", [["format"], {"format": math.inf, "step": 1}, {"format": FORMAT, "step": "x"}, NOW]
-)
+@pytest.mark.parametrize("header", [["format"], NOW])
 def test_what_is_no_checkpoint_is_refused(tmp_path: Path, header: object) -> None:
     (path := tmp_path / "step_000000002.pt").write_bytes(_envelope(header, b""))
     with pytest.raises(CheckpointError, match="is not a checkpoint of proposer_rl"):
@@ -223,7 +188,7 @@ def test_code_in_a_checkpoint_is_not_run(tmp_path: Path, save: Callable[[object]
     target = tmp_path / "executed"
     content = _envelope(NOW, save(_Malicious(target)))
     (tmp_path / "step_000000002.pt").write_bytes(content)
-    with pytest.raises(CheckpointError, match="must hold tensors and plain data") as caught:
+    with pytest.raises(CheckpointError, match="must hold only tensors and plain data") as caught:
         load_latest(tmp_path)
     assert "\n" not in str(caught.value) and "weights_only" not in str(caught.value)
     assert not target.exists()

@@ -15,7 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from proposer_rl.runs import folder as run_folder
-from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl, write_atomically
+from proposer_rl.runs.folder import (
+    RunFolder,
+    read_csv,
+    read_jsonl,
+    read_table,
+    write_atomically,
+)
 
 TEXT = st.text(st.characters(codec="utf-8", exclude_characters="\n\r"), max_size=12)
 CELLS = st.one_of(st.floats(), st.integers())
@@ -57,30 +63,16 @@ def test_jsonl_reads_back(
 
 
 def test_csv_is_what_other_programs_read(folder: RunFolder) -> None:
-    folder.append("metrics.csv", {"update": 1, "success/id": 0.1})
+    folder.append("metrics.csv", {"update": 1, "success/id": np.float64(0.1)})
     folder.append("metrics.csv", {"success/id": math.nan, "update": 2})
     assert (folder.path / "metrics.csv").read_text() == "update,success/id\n1,0.1\n2,nan\n"
 
 
-def test_float64_of_numpy_is_a_float(folder: RunFolder) -> None:
-    folder.append("metrics.csv", {"x": np.float64(0.1)})
-    assert read_csv(folder.path / "metrics.csv") == [{"x": 0.1}]
-
-
-@pytest.mark.parametrize(
-    ("row", "message"),
-    [
-        ({"update": 2}, "a row has update; its columns are update, loss"),
-        ({"update": 2, "loss": 0.1, "more": 1}, "a row has update, loss, more; its columns are"),
-    ],
-)
-def test_refuses_a_row_and_leaves_the_table(
-    folder: RunFolder, row: dict[str, object], message: str
-) -> None:
+def test_refuses_a_row_and_leaves_the_table(folder: RunFolder) -> None:
     folder.append("metrics.csv", {"update": 1, "loss": 0.5})
-    with pytest.raises(ValueError, match=message):
-        folder.append("metrics.csv", row)
-    with pytest.raises(ValueError, match="no commas, quotes or line breaks in their names"):
+    with pytest.raises(ValueError, match="a row has update; the columns are update, loss"):
+        folder.append("metrics.csv", {"update": 2})
+    with pytest.raises(ValueError, match="names must have no commas, quotes or line breaks"):
         folder.append("training.csv", {"a,b": 1})
     assert [path.name for path in folder.path.iterdir()] == ["metrics.csv"]
     assert read_csv(folder.path / "metrics.csv") == [{"update": 1, "loss": 0.5}]
@@ -128,28 +120,18 @@ def test_after_a_crash_at_any_byte(
     assert _contents(folder) == whole
 
 
-@pytest.mark.parametrize(
-    ("name", "read"), [("training.csv", read_csv), ("levels.jsonl", read_jsonl)]
-)
-def test_half_a_row_is_not_read(
-    folder: RunFolder, name: str, read: Callable[[Path], object]
-) -> None:
+@pytest.mark.parametrize("name", ["training.csv", "levels.jsonl"])
+def test_half_a_row_is_not_read(folder: RunFolder, name: str) -> None:
     folder.append(name, {"a": 1})
     with open(folder.path / name, "ab") as file:
         file.write(b"2")
-    assert read(folder.path / name) == [{"a": 1}]
+    assert read_table(folder.path / name) == [{"a": 1}]
     assert folder.lengths() == {name: 1}
     folder.cut_back({name: 1})
     folder.append(name, {"a": 2})
-    assert read(folder.path / name) == [{"a": 1}, {"a": 2}]
-
-
-def test_half_a_header_is_no_row(folder: RunFolder) -> None:
-    (folder.path / "training.csv").write_text("upd")
-    assert folder.lengths() == {"training.csv": 0}
-    assert read_csv(folder.path / "training.csv") == []
-    folder.cut_back({"training.csv": 0})
-    assert folder.lengths() == {}
+    assert read_table(folder.path / name) == [{"a": 1}, {"a": 2}]
+    (folder.path / name).write_text("upd")  # half a header
+    assert read_table(folder.path / name) == [] and folder.lengths() == {name: 0}
 
 
 def test_cut_back_checks_all_before_it_changes_anything(folder: RunFolder) -> None:
@@ -157,8 +139,6 @@ def test_cut_back_checks_all_before_it_changes_anything(folder: RunFolder) -> No
     before = _contents(folder)
     with pytest.raises(ValueError, match=r"cycles\.jsonl has 3 rows, fewer than the 4"):
         folder.cut_back({"metrics.csv": 1, "cycles.jsonl": 4})
-    with pytest.raises(ValueError, match=r"training\.csv has 0 rows"):
-        folder.cut_back({"training.csv": 1})
     assert _contents(folder) == before
 
 
@@ -183,7 +163,6 @@ def test_cut_back_leaves_other_files_alone(folder: RunFolder) -> None:
 @pytest.mark.parametrize(
     ("read", "content", "message"),
     [
-        (read_csv, "a,b\n1\n", "line 2: .* shorter"),
         (read_csv, "a,b\n1,2\n1,2,3\n", "line 3: .* longer"),
         (read_csv, "a\nx\n", "line 2: could not convert string to float: 'x'"),
         (read_jsonl, '{"a": 1}\n{"a"\n', "line 2: Expecting"),
@@ -232,9 +211,8 @@ def test_a_file_system_that_cannot_sync_folders_is_warned_of_once(
         warnings.simplefilter("default")
         for _ in range(2):
             write_atomically(tmp_path / "x", b"new")
-    assert [str(one.message).partition(" (")[0] for one in told] == [
-        "folders cannot be synced here"
-    ]
+    (one,) = told
+    assert str(one.message).startswith("folders cannot be synced here")
     assert (tmp_path / "x").read_bytes() == b"new"
 
 

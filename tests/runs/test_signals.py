@@ -114,7 +114,7 @@ def test_a_stopped_call_says_that_all_is_saved_and_how_it_goes_on(
         proposer_rl.train("maze", "target", **few)
     folder = caught.value.folder
     assert folder is not None and str(caught.value) == (
-        f"stopped by SIGINT; all is saved. The same call with folder={str(folder)!r} goes on"
+        f"stopped by SIGINT; all is saved. To resume, call again with folder={str(folder)!r}"
     )
     proposer_rl.train("maze", "target", **few, folder=folder)
     proposer_rl.train("maze", "target", **few, folder="whole")

@@ -127,9 +127,9 @@ def test_single_values_are_spaced_by_their_logarithms() -> None:
 @pytest.mark.parametrize(
     ("given_", "target", "message"),
     [
-        (prl.Log(0.0, 1.0), None, r"low=0.0: must be above 0 on a log"),
+        (prl.Log(0.0, 1.0), None, r"low=0.0 must be below .*, and above 0 on a log"),
         (prl.Log(2.0, 1.0), None, r"low=2.0 must be below high=1.0"),
-        ({"low": -1.0, "high": 1.0, "log": True}, None, "low=-1.0: must be above 0 on a log"),
+        ({"low": -1.0, "high": 1.0, "log": True}, None, "low=-1.0 must .* above 0 on a log"),
         ({"values": [0, 1], "log": True}, None, "log=True: needs numbers above 0"),
         ({"values": ["a", "b"], "log": True}, None, "log=True: needs numbers above 0"),
         (prl.Log(0.1, 1.0), (-1.0, 0.5), r"target.x=\(-1.0, 0.5\): must be above 0 on a log"),

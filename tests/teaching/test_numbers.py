@@ -1,4 +1,4 @@
-"""Numbers and lists of other libraries, and those that are too large, in spaces and results."""
+"""Numbers and lists of other libraries in spaces and results, and what becomes of features."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import re
 import warnings
 from collections.abc import Callable
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,15 @@ from hypothesis import given
 from hypothesis import settings as profile
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
+from scipy.stats import rankdata
+from sklearn.decomposition import PCA
+from tensordict import TensorDict
 
 import proposer_rl as prl
+from proposer_rl.curricula.belief import WIDEST
 from proposer_rl.settings import ArgumentError
 from proposer_rl.tasks.ranges import RangeSettings, spaces
+from proposer_rl.teaching.tables import few_columns, ranks
 from tests.teaching.counting import Counting
 
 NAN, INF, HUGE = float("nan"), float("inf"), 1e39  # finite in float64, not in float32
@@ -69,7 +75,9 @@ def test_texts_may_be_in_any_list(kind: str) -> None:
     assert space.distributions["both"].size == 2  # type: ignore[attr-defined]
 
 
-def test_choices_that_are_arrays_stay_what_they_are() -> None:
+def test_choices_that_are_arrays_or_lists_stay_what_they_are() -> None:
+    lists = prl.Parameters({"size": [[1, 2], [3, 4]]}, target={"size": [[3, 4]]})
+    assert lists.target_shares.tolist() == [0, 1]
     mazes = [np.eye(2), np.ones((2, 2))]
     assert all(
         any(level["maze"] is m for m in mazes) for level in levels(prl.Parameters({"maze": mazes}))
@@ -153,6 +161,7 @@ TARGETS = [np.array([1, 2]), torch.tensor([1, 2]), range(1, 3), pd.Series([1, 2]
 def test_places_of_items_may_be_in_any_list(target: Any) -> None:
     assert prl.Items(np.int64(3), target=target).target_shares.tolist() == [0, 0.5, 0.5]
     assert prl.Items(3, target=np.int64(2)).target_shares.tolist() == [0, 0, 1]
+    assert prl.Items(3, target=[1, 2, 2, 2]).target_shares.tolist() == [0, 0.25, 0.75]
 
 
 COLORS = pd.get_dummies(pd.Series(["red", "blue", "red"]))  # a table of truth values
@@ -196,17 +205,32 @@ def far_target() -> None:
     prl.Parameters({"g": (0.0, 1.0)}, target={"g": {"distribution": "norm", "loc": 5.0}})
 
 
-def some_successes() -> None:
+def told(recipe: Any, *successes: Any) -> Callable[[], None]:
+    def tell() -> None:
+        teacher = prl.Teacher(recipe, LINE)
+        for success in successes:
+            teacher.tell(teacher.ask()[0], 0.0, success)
+
+    return tell
+
+
+def unsuccessful_rollouts() -> None:
     teacher = prl.Teacher("adaptive_mixture", LINE)
-    for success in (None, True, None, True):
-        teacher.tell(teacher.ask()[0], 0.0, success)
+    after = {"reward": torch.ones(2, 3, 1), "done": torch.zeros(2, 3, 1, dtype=torch.bool)}
+    after["done"][:, -1] = True
+    after["terminated"] = after["done"]
+    for _ in range(2):
+        level = teacher.ask(2)[0].view(2, 1, 1).expand(2, 3, 1)
+        teacher.observe(TensorDict({"level_id": level, "next": after}, [2, 3]))
 
 
 @pytest.mark.parametrize(
     ("misread", "message"),
     [
-        (far_target, "target.g: most of it, norm.*, lies outside of 0 to 1"),
-        (some_successes, "success: told of some levels alone"),
+        (far_target, "target.g: most of norm.* lies outside of 0 to 1"),
+        (told("plr", None, True, None, True), "success: told of some levels only"),
+        (told("adaptive_mixture", None, True, None), "success: missing: this curriculum learns"),
+        (unsuccessful_rollouts, "success: missing: this curriculum learns"),
     ],
 )
 def test_what_may_be_misread_is_said_once(misread: Callable[[], None], message: str) -> None:
@@ -215,92 +239,97 @@ def test_what_may_be_misread_is_said_once(misread: Callable[[], None], message: 
     assert len(said) == 1
 
 
+@pytest.mark.parametrize("told_", [told("adaptive_mixture", 0, 1), told("plr", None, None)])
+def test_nothing_is_said_of_success_that_is_told_or_not_used(told_: Callable[[], None]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        told_()
+
+
+def doubles(n: int, generator: torch.Generator) -> torch.Tensor:
+    return torch.rand(n, 3, generator=generator, dtype=torch.float64)
+
+
+REAL = {
+    "parameters": lambda: LINE,
+    "a logarithmic scale": lambda: prl.Parameters({"s": prl.Log(0.01, 1.0)}),
+    "drawn": lambda: prl.LevelGenerator(doubles, target=doubles),
+    "drawn by name": lambda: prl.LevelGenerator(lambda n, g: TensorDict({"s": doubles(n, g)}, [n])),
+    "made": lambda: prl.MadeLevels({"s": (0.0, 1.0)}, lambda values, g: doubles(len(values), g)),
+    "a task": lambda: SimpleNamespace(space=prl.Parameters({"s": (0.0, 1.0)})),
+}
+
+
+@pytest.mark.parametrize("space", REAL)
+def test_a_network_takes_the_levels_of_every_space(space: str) -> None:
+    """Whoever asks gets torch's default dtype; a parameter by itself is a number of Python's."""
+    teacher = prl.Teacher("domain_randomization", REAL[space]())
+    for levels in (teacher.propose(4), teacher.ask(4)[1], teacher.ask()[1]):
+        entries = [levels] if isinstance(levels, torch.Tensor) else [*levels.values()]
+        for entry in entries:
+            assert type(entry) is float or entry.dtype is torch.float32
+
+
 def test_an_array_that_a_function_draws_is_a_tensor() -> None:
     def draw(n: int, generator: torch.Generator) -> Any:
         return np.arange(3.0 * n).reshape(n, 3)[::-1]
 
     space = prl.LevelGenerator(draw, target=draw, edit=lambda levels, count, g: levels.numpy() + 1)
     _, drawn = prl.Teacher("target", space).ask(4)
-    assert (
-        drawn.dtype == torch.float64 and drawn.tolist() == draw(384, torch.Generator())[:4].tolist()
-    )
+    assert drawn.tolist() == draw(32, torch.Generator())[:4].tolist()
     batch = space.sample(4, torch.Generator())[None]
     assert (space.edit(batch, 1, [torch.Generator()])["level"] == batch["level"] + 1).all()
 
 
-def draws(what: Any) -> Any:
-    return prl.Teacher("plr", prl.LevelGenerator(lambda n, g: what(n))).ask()
-
-
-NINE = {"g": range(9)}
 LOW = {"low": 0, "high": 9}
-NO_PARAMETERS: list[tuple[Any, dict[str, Any], str]] = [
-    ({"g": ["a", "b", "a"]}, {}, "ranges.g=.*: values=.*: must have each once"),
-    ({"g": ["a", "b"]}, {"target": {"g": []}}, r"target.g=\[\]: must be among"),
-    ({"g": (0.0, HUGE)}, {}, r"ranges.g=\(0.0, 1e\+39\): .* both finite, at"),
-    ({"g": (2.0, 1.0)}, {}, r"ranges.g=\(2.0, 1.0\): low=2.0 must be below"),
-    ({"g": (0, 10**400)}, {}, r"ranges.g=\(0, 10{70}.*too large"),
-    ({"g": []}, {}, r"ranges.g=\[\]: must be \(low, high\), a range or a list"),
-    ({"g": {"low": 0.0}}, {}, "ranges.g={'low': 0.0}: needs either values, or low, high"),
-    ({"g": {**LOW, "target": [5, 11]}}, {}, r"target.g=\(5, 11\): must lie within 0 to 9"),
-    ({"g": LOW}, {"target": {"g": {**NORMAL, "scale": 0}}}, "target.g.scale=0: input should be gr"),
-    ({"g": [1.0, 2.0, 4.0]}, {"target": {"g": 3.0}}, r"target.g=3.0: must be among \[1.0, 2.0, "),
-    (NINE, {"target": {"g": NORMAL}}, "target.g.distribution=norm: of a continuous range only"),
-    ({"seed": (0, 1)}, {"seeded": True}, "ranges.seed, seeded=True: a level has one"),
-    ({"g": ["a", "b"]}, {"target": {"g": ["a", "a"]}}, r"target.g=.*\['a', 'b'\], each once"),
-    (NINE, {"target": {"g": 2.5}}, "target.g=2.5: must be whole, as the range is"),
-    (NINE, {"target": {"g": ["a"]}}, r"target.g=\['a'\]: must be "),
-    (NINE, {"bins": {"g": np.float64(2)}}, "bins.g=2.0: must be a wh"),
+NINE, TEXTS = {"g": range(9)}, {"g": ["a", "b"]}
+MASKED = np.ma.array([[0.0], [9.0]], mask=[[0], [1]])
+P, D, PLR = prl.Parameters, prl.Items, partial(prl.Teacher, "plr")
+WRONG: list[tuple[Any, Any, dict[str, Any], str]] = [
+    (P, {"g": ["a", "b", "a"]}, {}, "ranges.g=.*: values=.*: must have each once"),
+    (P, TEXTS, {"target": {"g": []}}, r"target.g=\[\]: must be among"),
+    (P, {"g": (0.0, HUGE)}, {}, r"ranges.g=\(0.0, 1e\+39\): .* both finite, at"),
+    (P, {"g": (0, 10**400)}, {}, r"ranges.g=\(0, 10{70}.*too large"),
+    (P, {"g": []}, {}, r"ranges.g=\[\]: must be \(low, high\), a range or a list"),
+    (P, {"g": {**LOW, "target": [5, 11]}}, {}, r"target.g=\(5, 11\): must lie within 0 to 9"),
+    (P, {"g": LOW}, {"target": {"g": {**NORMAL, "scale": 0}}}, "target.g.scale=0: input should"),
+    (P, TEXTS, {"target": {"g": ["a", "a"]}}, r"target.g=.*\['a', 'b'\], each once"),
+    (P, NINE, {"target": {"g": 2.5}}, "target.g=2.5: must be whole, as the range is"),
+    (P, NINE, {"target": {"g": ["a"]}}, r"target.g=\['a'\]: must be "),
+    (P, NINE, {"target": {"h": 1}}, "target.h: unknown; there are: g"),
+    (P, NINE, {"bins": {"h": 2}}, "bins.h: unknown; there are: g"),
+    (P, NINE, {"bins": {"g": np.float64(2)}}, "bins.g=2.0: must be a wh"),
+    (D, np.bool_(True), {}, "count=True: must be a whole number, at least 1"),
+    (D, 4, {"target": np.array([True, False])}, r"target=\[True, False\]: must be whole numbers"),
+    (D, 4, {"named": {"easy": [0, 4]}}, r"easy=\[0, 4\]: must be whole numbers from 0 to 3"),
+    (D, 2, {"features": np.array([[HUGE], [0]])}, "features=1e[+]39: must be finite"),
+    (D, 2, {"features": {"a": ["x", "y"], "b": [1, {}]}}, "features.b=.*: must be numbers of"),
+    (D, 300, {"features": [*map(str, range(300))]}, "features.0: has 300 different texts, .* 256"),
+    (D, 2, {"pass_rates": [0.5]}, r"pass_rates: has shape \[1\], but must have \[2\]"),
+    (D, 2, {"pass_rates": [0.5, 1.5]}, "pass_rates=1.5: must be from 0 to 1"),
+    (D, 2, {"features": [1.0, 2.0]}, r"features: has shape \[2\], but must have \[2, n\]"),
+    (D, 2, {"features": MASKED}, "features=nan: "),
+    (PLR, LINE, {"seed": True}, "seed=True: must be a whole number"),
+    (PLR, LINE, {"sing": abs}, "sing: unknown; there are: play, "),
+    (PLR, {"s": (0.0, 1.0)}, {}, "space={'s': .*: must be Parameters, Items"),
+    (prl.Teacher, "prl", {"space": LINE}, "curriculum='prl': must be .* one of accel"),
+    (prl.Teacher, prl.tasks.maze(), {"space": LINE}, "curriculum=Recipe.*: must be prl"),
 ]  # fmt: skip
-NO_ITEMS: list[tuple[Any, dict[str, Any], str]] = [
-    (np.bool_(True), {}, "count=True: must be a whole number, at least 1"),
-    (4, {"target": np.array([True, False])}, r"target=\[True, False\]: must be places"),
-    (2, {"features": np.array([[HUGE], [0]])}, "features=1e[+]39: must be finite"),
-    (2, {"features": {"a": ["x", "y"], "b": [1, {}]}}, "features.b=.*: must be numbers of float32"),
-    (300, {"features": [*map(str, range(300))]}, "features.0: has 300 texts that differ; .* 256"),
-    (2, {"pass_rates": [0.5]}, r"pass_rates: has shape \[1\], but must have \[2\]"),
-    (2, {"pass_rates": [0.5, 1.5]}, "pass_rates=1.5: must be from 0 to 1"),
-    (2, {"features": [1.0, 2.0]}, r"features=\[2\]: must be \[2, D\], a row for each item"),
-    (2, {"features": np.ma.array([[0.0], [9.0]], mask=[[0], [1]])}, "features=nan: "),
-]  # fmt: skip
-NO_LEVELS: list[tuple[Any, dict[str, Any], str]] = [
-    (lambda n: pd.DataFrame({"a": range(n)}), {}, r"draw=\[1, 1\]: must give a tensor"),
-    (
-        lambda n: np.ones((n + 1, 2)),
-        {},
-        r"draw=\[2, 2\]: must give .* of 1 levels",
-    ),
-]
-NO_TEACHER: list[tuple[Any, dict[str, Any], str]] = [
-    (LINE, {"seed": True}, "seed=True: must be a whole number"),
-    (LINE, {"sing": abs}, "sing: unknown; there are: play, "),
-    (LINE, {"student": prl.Student(), "play": abs}, "play: give it to the student"),
-    ({"s": (0.0, 1.0)}, {}, "space={'s': .*: must be Parameters, Items"),
-]
-NO_CURRICULUM: list[tuple[Any, dict[str, Any], str]] = [
-    ("prl", {"space": LINE}, "curriculum='prl': must be .* one of accel"),
-    (prl.tasks.maze(), {"space": LINE}, "curriculum=Recipe.*: must be prl.curricula.NAME"),
-]
-NO_GENERATOR: list[tuple[Any, dict[str, Any], str]] = [
-    (torch.rand, {"named": {"all": torch.rand}}, "named.all: must have another name"),
-]
-NOT_THERE = [
-    *((prl.Parameters, *row) for row in NO_PARAMETERS),
-    *((prl.Items, *row) for row in NO_ITEMS),
-    *((draws, *row) for row in NO_LEVELS),
-    *((partial(prl.Teacher, "plr"), *row) for row in NO_TEACHER),
-    *((prl.Teacher, *row) for row in NO_CURRICULUM),
-    *((prl.LevelGenerator, *row) for row in NO_GENERATOR),
-]
 
 
-@pytest.mark.parametrize(("make", "given_", "more", "message"), NOT_THERE)
-def test_what_is_no_number_there_is_refused_in_one_line(
-    make: Any, given_: Any, more: dict[str, Any], message: str
+@pytest.mark.parametrize(("make", "value", "more", "message"), WRONG)
+def test_what_is_wrong_is_refused_in_one_line(
+    make: Any, value: Any, more: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ArgumentError, match=rf"^{message}") as refused:
-        make(given_, **more)
+        make(value, **more)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("drawn", [pd.DataFrame({"a": [1]}), np.ones((2, 2)), [[1.0], [2.0]]])
+def test_as_many_levels_are_drawn_as_were_asked_for(drawn: Any) -> None:
+    with pytest.raises((RuntimeError, TypeError)):
+        prl.Teacher("plr", prl.LevelGenerator(lambda n, g: drawn)).ask()
 
 
 @pytest.mark.parametrize("name", ["plr", "learning_progress"])
@@ -329,3 +358,38 @@ def test_results_are_those_that_float32_can_keep(number: float) -> None:
         except ArgumentError as error:
             assert re.match(r"return_=\S+: must be finite in float32", str(error))
             assert not kept or abs(number) > np.finfo(np.float32).max
+
+
+@profile(max_examples=50)
+@given(st.lists(st.floats(-1e12, 1e12), min_size=1, max_size=9))
+def test_ranks_are_those_of_scipy(column: list[float]) -> None:
+    found = ranks(torch.tensor(column, dtype=torch.float64).unsqueeze(1))[:, 0]
+    expected = (2 * rankdata(column) - 1) / len(column) - 1
+    assert found.tolist() == pytest.approx(expected.tolist(), abs=1e-6)
+
+
+@pytest.mark.parametrize("last", [None, 0.8, float("nan")])
+def test_wide_features_leave_room_for_pass_rates(last: float | None) -> None:
+    generator = torch.Generator().manual_seed(0)
+    embedding = torch.randn(40, 60, generator=generator) * torch.linspace(0.1, 9, 60)
+    rates = None if last is None else [0.2] * 39 + [last]
+    items = prl.Items(40, features=embedding, pass_rates=rates)
+    known = items.inputs(items.generate(torch.arange(40), []))
+    assert known.shape == (40, WIDEST)  # a belief would project more, the rates among them
+    columns = {None: 0, 0.8: 1}.get(last, 2)  # the second says where there is no rate
+    torch.testing.assert_close(known[:, : WIDEST - columns], few_columns(embedding, columns))
+    for column in known[:, WIDEST - columns :].mT[-1:]:
+        assert column.tolist() == pytest.approx([-1 / 40] * 39 + [39 / 40])
+
+
+def test_wide_features_are_ranks_of_their_principal_components() -> None:
+    table = torch.randn(50, 30, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    table = table @ torch.randn(30, 30, generator=torch.Generator().manual_seed(2)).double()
+    own = ((table - table.mean(0)) / table.std(0)).clamp(-3, 3).numpy()
+    # They are not centred once more after outliers were cut off.
+    expected = PCA(WIDEST).fit_transform(own - own.mean(0))
+    found = few_columns(table)
+    for place in range(4):  # those that are far apart in variance; signs are free
+        twin = torch.from_numpy(rankdata(expected[:, place])).float()
+        alike = torch.corrcoef(torch.stack([found[:, place], twin]))[0, 1].abs()
+        assert float(alike) > 0.98

@@ -26,20 +26,16 @@ PACKAGES = (
 EXAMPLE = Path(__file__).parents[2] / "examples" / "taught_prompts.py"
 ROWS, ANSWERS = 10, 2
 Settings = dict[str, Any]
+NAMES = ("gradient_accumulation_steps", "per_device_train_batch_size", "steps_per_generation")
+TWICE = {"num_iterations": 2}
 SETTINGS: dict[str, Settings] = {
-    "a generation a step": {"gradient_accumulation_steps": 1, "per_device_train_batch_size": 8},
-    "TRL's defaults": {"gradient_accumulation_steps": 4, "per_device_train_batch_size": 4},
+    "a generation a step": dict(zip(NAMES[:2], (1, 8), strict=True)),
+    "TRL's defaults": dict(zip(NAMES[:2], (4, 4), strict=True)),
     "a generation for four steps": {
-        "gradient_accumulation_steps": 1,
-        "per_device_train_batch_size": 2,
-        "steps_per_generation": 2,
+        **dict(zip(NAMES, (1, 2, 2), strict=True)),
         "num_iterations": 2,
     },
-    "four generations in three steps": {
-        "gradient_accumulation_steps": 4,
-        "per_device_train_batch_size": 2,
-        "steps_per_generation": 3,
-    },
+    "four generations in three steps": dict(zip(NAMES, (4, 2, 3), strict=True)),
 }
 
 
@@ -181,12 +177,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a stream": ({"stream": True}, "^train_dataset: a stream, but must be a Dataset with one row"),
     "skipping ignored": ({"ignore_data_skip": True}, "ignore_data_skip=True: must be false"),
     "columns removed": ({"remove_unused_columns": True}, "remove_unused_columns=True: must be"),
-    "not attached": ({"attach": False}, "trainer: missing: call attach"),
     "no such column": ({"source": "family"}, "Column 'family' doesn't exist"),
     "attached before": ({"twice": True}, "duplicated columns but columns .'teacher_item'."),
-    "not its reward": ({"other": True}, "reward_funcs: must have this TaughtReward"),
+    "not its reward": ({"other": True}, "reward_funcs: must contain this TaughtReward"),
     "no share": ({"reward": torch.nan}, "success=nan: must be from"),
-    "no items": ({"space": prl.Parameters({"gravity": (5.0, 25.0)})}, "a space of Items"),
 }
 
 
@@ -196,8 +190,7 @@ def test_what_does_not_fit_is_refused_in_one_line(taught: Any, what: str, tmp_pa
     given, message = REFUSED[what]
     settings = {name: given[name] for name in given if name.endswith(("skip", "columns"))}
     with pytest.raises((ArgumentError, ValueError), match=message):
-        space = given.get("space") or prl.Items(given.get("items", ROWS))
-        teacher = prl.Teacher("domain_randomization", space)
+        teacher = prl.Teacher("domain_randomization", prl.Items(given.get("items", ROWS)))
 
         def scored(completions: list[str], **_: Any) -> list[float]:
             return [given.get("reward", 1.0)] * len(completions)
@@ -206,7 +199,7 @@ def test_what_does_not_fit_is_refused_in_one_line(taught: Any, what: str, tmp_pa
         settings |= SETTINGS["a generation a step"]
         used = scored if "other" in given else reward
         trainer = make(used, settings, tmp_path, given.get("stream", False))
-        for _ in range(given.get("attach", True) + given.get("twice", False)):
+        for _ in range(1 + given.get("twice", False)):
             reward.attach(trainer)
         train(trainer, 1)
 

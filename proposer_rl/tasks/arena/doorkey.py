@@ -45,7 +45,7 @@ class DoorkeyEnv(BatchedEnv):
     def advance(self, state: Tensor, action: Tensor, level: Values, chance: Tensor) -> Step:
         """Returns the step's result: what the action does to the agent, the key and the door."""
         wall, door, how, key_x, key_y, x, y, way, steps = state.unbind(-1)
-        to_x, to_y = x + _aside(way + 1), y + _aside(way)
+        to_x, to_y = x + aside(way + 1), y + aside(way)
         walls, keys, doors, goal = _things(state, level, to_x, to_y)
         free, carried = ~(walls | keys | doors | goal), key_x < 0
         walked = (action == FORWARD) & (free | goal | (doors & (how == OPEN)))
@@ -68,22 +68,36 @@ class DoorkeyEnv(BatchedEnv):
 
     def observe(self, state: Tensor, level: Values) -> Tensor:
         """Returns MiniGrid's numbers of what is seen ahead, from far to near and left to right."""
-        x, y, way = (state[..., place, None, None] for place in (5, 6, 7))
-        numbers = torch.arange(VIEW, device=state.device)
-        forward, right = (VIEW - 1 - numbers).unsqueeze(-1), numbers - VIEW // 2
-        to_x = x + forward * _aside(way + 1) - right * _aside(way)
-        to_y = y + forward * _aside(way) + right * _aside(way + 1)
+        to_x, to_y, here = cells_in_view(*state[..., 5:8].unbind(-1))
         walls, keys, doors, goal = _things(state, level, to_x, to_y)
-        here = (forward == 0) & (right == 0)
         how, carried = state[..., 2, None, None], state[..., 3, None, None] < 0
         kind = 1 + walls * 1 + keys * 2 + goal * 3 + doors * (4 + how.int())
         kind = torch.where(here, 1 + 2 * carried, kind)
         closed = walls | (doors & (how != OPEN))
         looks = state.new_tensor([UNSEEN, EMPTY, WALL, KEY, GOAL, *DOORS])
-        return looks[kind * _seen(~closed | here)].flatten(-3)
+        return looks[kind * seen(~closed | here)].flatten(-3)
 
 
-def _aside(way: Tensor) -> Tensor:
+def cells_in_view(x: Tensor, y: Tensor, way: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns where the cells lie that an agent looks at, and which of them it stands in.
+
+    Args:
+        x: column of the agent, float [*B].
+        y: its row, likewise.
+        way: direction in which it looks, from 0 (right) over 1 (down) to 3 (up), likewise.
+
+    Returns:
+        Columns and rows, float [*B, 7, 7], from far to near and left to right, and a mask [7, 7].
+    """
+    x, y, way = (number[..., None, None] for number in (x, y, way))
+    numbers = torch.arange(VIEW, device=x.device)
+    forward, right = (VIEW - 1 - numbers).unsqueeze(-1), numbers - VIEW // 2
+    to_x = x + forward * aside(way + 1) - right * aside(way)
+    to_y = y + forward * aside(way) + right * aside(way + 1)
+    return to_x, to_y, (forward == 0) & (right == 0)
+
+
+def aside(way: Tensor) -> Tensor:
     """Returns how far down a step goes in a direction, 0 (right) to 3 (up); right, in the next."""
     return (way % 2) * (2 - (way % 4))
 
@@ -104,14 +118,14 @@ def _things(
     return walls & ~doors, (x == key_x) & (y == key_y), doors, goal
 
 
-def _seen(clear: Tensor) -> Tensor:
+def seen(clear: Tensor) -> Tensor:
     """Returns what is seen of a view [*B, 7, 7] from its lowest row's middle, as MiniGrid does."""
     bits = 2 ** torch.arange(VIEW, device=clear.device)
     row, rows = 2 ** (VIEW // 2), []
-    seen, above = SIGHT.to(clear.device)
+    lit, above = SIGHT.to(clear.device)
     for ahead in reversed((clear * bits).sum(-1).unbind(-1)):
         place = 2**VIEW * row + ahead
-        rows.append(seen[place])
+        rows.append(lit[place])
         row = above[place]
     return (torch.stack(rows[::-1], -1).unsqueeze(-1) & bits) > 0
 

@@ -1,4 +1,4 @@
-"""Any Gymnasium environment as a task: what is set in it makes a level."""
+"""Any Gymnasium environment as a task, in which settings make a level."""
 
 import sys
 from types import ModuleType
@@ -6,11 +6,11 @@ from typing import Any, NoReturn
 
 
 class _Package(ModuleType):
-    """This package, which has the name of a task's file, as ``prl.tasks.maze`` has that of one."""
+    """Explains what to call instead of this package, which is named as a file of ``conf/task``."""
 
     def __call__(self, *_: Any, **__: Any) -> NoReturn:
         raise TypeError(
-            "gymnasium is a module to import; see prl.tasks.from_gymnasium(env_id, ...)"
+            "prl.tasks.gymnasium is a module; call prl.tasks.from_gymnasium(env_id, ...)"
         )
 
 

@@ -1,4 +1,4 @@
-"""Environments of Gymnasium as one of TorchRL, each on its own level, in one process or several."""
+"""Steps a batch of Gymnasium environments, each on its own level, as one TorchRL environment."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from proposer_rl.models import available_cores, check_torch_defaults
-from proposer_rl.tasks.gymnasium.answers import SuccessSettings, UnfitEnvironmentError
+from proposer_rl.tasks.gymnasium.environment import SuccessSettings, UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.player import (
     GymLevel,
     LevelPlayer,
@@ -38,32 +38,33 @@ from proposer_rl.tasks.gymnasium.spaces import Layout, in_order
 from proposer_rl.tasks.parameters import SEED
 
 Vectorization = Literal["sync", "async"]
-FLAGS = ("success", "is_init")  # entries that no Solver sees
-# A fork of this process would inherit the locks that its other threads hold, torch's among them,
-# and wait for them forever. The fork server has no threads, and imports torch once for all.
+FLAGS = ("success", "is_init")  # entries that Solvers do not see
+# A fork of this process would inherit locks that its other threads hold, such as torch's, and wait
+# for them forever. The fork server has no threads, and imports torch once for all processes.
 _FORKSERVER = "forkserver" in multiprocessing.get_all_start_methods()  # not on Windows
 CONTEXT: Any = multiprocessing.get_context("forkserver" if _FORKSERVER else "spawn")
-GRACE = 10.0  # seconds that a process has for its end
+GRACE = 10.0  # seconds that a process has to end
 _STARTING = Lock()
 
 
 class GymnasiumEnv(EnvBase):
-    """A batch of environments of Gymnasium, stepped by its vector environments.
+    """A batch of Gymnasium environments, stepped by Gymnasium's vector environments.
 
-    An environment whose episode is over begins its level again, from the same seed. Observations
-    are those of a :class:`~proposer_rl.tasks.gymnasium.spaces.Layout`, ``observation`` and perhaps
-    images; ``success``, bool [*B, 1], whether the step ended an episode that counts as one; and
-    ``is_init``, bool [*B, 1], whether the step begins one. ``reward`` is scaled.
+    After an episode an environment begins its level again, from the same seed. Observations are
+    those of a :class:`~proposer_rl.tasks.gymnasium.spaces.Layout`: ``observation``, and perhaps
+    images. ``success``, bool [*B, 1], is whether a step ended a successful episode, and
+    ``is_init``, bool [*B, 1], whether a state begins an episode. ``reward`` is scaled.
 
     Args:
-        levels: as :class:`~proposer_rl.tasks.parameters.ParameterSpace` makes them, [*B]. Their
-            device is that of the states.
+        levels: of a :class:`~proposer_rl.tasks.parameters.ParameterSpace`, [*B]; states are on
+            their device.
         make: makes one environment.
         parameters: what differs between levels, by name.
-        success: when an episode is one.
-        reward_scale: rewards are multiplied with it.
-        vectorization: one after another, or in as many processes as there are cores.
-        once: play one episode of each level, and then stand still, without reward.
+        success: when an episode is a success.
+        reward_scale: factor of the rewards.
+        vectorization: ``"sync"`` steps one after another, ``"async"`` in as many processes as
+            there are cores.
+        once: whether to play one episode of each level and then stand still, without reward.
     """
 
     def __init__(
@@ -110,7 +111,7 @@ class GymnasiumEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         options = None if mask is None else {"reset_mask": mask.reshape(-1).cpu().numpy()}
         seen, _ = self._vector.reset(options=options)
-        # Of these TorchRL takes over only the entries of the environments that are reset.
+        # TorchRL takes these entries only for the environments that are reset.
         none = np.zeros(self._vector.num_envs, np.bool_)
         return self._batched(seen, success=none, is_init=~none)
 
@@ -129,10 +130,10 @@ class GymnasiumEnv(EnvBase):
         )
 
     def _batched(self, seen: Any, **entries: NDArray[Any]) -> TensorDict:
-        """Returns entries [n, ...] of all environments as [*B, ...], single numbers as [*B, 1].
+        """Returns entries [n, ...] as [*B, ...], single numbers as [*B, 1].
 
         Raises:
-            UnfitEnvironmentError: for a number that is not finite as float32, naming the level.
+            UnfitEnvironmentError: naming the level, if a number is not finite as float32.
         """
         shown = map(torch.as_tensor, in_order(self._layout.observation_space, seen))
         found = self._layout.entries(shown)
@@ -163,11 +164,11 @@ class GymnasiumEnv(EnvBase):
         self.done_spec = Composite(ends, shape=batch).to(self.device)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Does nothing, as what is random belongs to the levels."""
+        """Does nothing: random numbers come from the levels' seeds."""
 
 
 def plays(levels: TensorDictBase, parameters: Mapping[str, ParameterSettings]) -> list[GymLevel]:
-    """Returns what players are to play for levels [*B] of some parameters, in one row."""
+    """Returns levels [*B] of a parameter space as a flat list for players."""
     rows = levels.reshape(-1)
     columns = [given.space_bins().named(rows[name]) for name, given in parameters.items()]
     return [
@@ -177,23 +178,23 @@ def plays(levels: TensorDictBase, parameters: Mapping[str, ParameterSettings]) -
 
 
 class LostProcessError(RuntimeError):
-    """A process of the environments has ended; the message is one line."""
+    """A process that steps environments has ended; the message is one line."""
 
     exit_code = 6
 
 
 class ProcessVectorEnv:
-    """The part of Gymnasium's vector environments that is used here, over several processes.
+    """Steps environments in several processes, as Gymnasium's vector environments do in one.
 
-    Which process an environment is in changes nothing that it does.
+    The number of processes does not change what an environment does.
 
     Args:
-        makes: make the environments.
-        count: processes, at most as many as environments.
+        makes: functions that make the environments.
+        count: processes, of which there are at most as many as environments.
 
     Attributes:
         num_envs: number n of environments.
-        single_observation_space, single_action_space: of each.
+        single_observation_space, single_action_space: of each environment.
         processes: that step them.
     """
 
@@ -212,7 +213,7 @@ class ProcessVectorEnv:
             theirs.close()
             self._pipes.append(ours)
             self.processes.append(process)
-        # Cloudpickle sends classes and functions of a script as they are.
+        # Cloudpickle also sends classes and functions of a script.
         vectors = [
             partial(SyncVectorEnv, [makes[i] for i in part], autoreset_mode=AutoresetMode.DISABLED)
             for part in self._parts
@@ -222,34 +223,22 @@ class ProcessVectorEnv:
         self.single_action_space: spaces.Space[Any] = found[0][1]
 
     def reset(self, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode everywhere, or where the options' ``reset_mask``, bool [n], says so."""
+        """Begins episodes in all environments, or in those of the ``reset_mask``, bool [n]."""
         parts = [(options and {"reset_mask": options["reset_mask"][part]},) for part in self._parts]
-        return tree_map(lambda *each: np.concatenate(each), *self._ask("reset", parts)), {}
+        return _joined(self._ask("reset", parts)), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Takes a step in each environment, with actions [n, ...]."""
         shares = [tree_map(lambda rows, part=part: rows[part], actions) for part in self._parts]
-        answers = self._ask("step", [(share,) for share in shares])
-        seen, *ends, infos = zip(*answers, strict=True)
-        success = [
-            info.get("success", np.zeros(len(part), np.bool_))
-            for info, part in zip(infos, self._parts, strict=True)
-        ]
-        rewards, terminated, truncated, successes = map(np.concatenate, (*ends, success))
-        return (
-            tree_map(lambda *each: np.concatenate(each), *seen),
-            rewards,
-            terminated,
-            truncated,
-            {"success": successes},
-        )
+        answer: Any = _joined(self._ask("step", [(share,) for share in shares]))
+        return answer
 
     def set_attr(self, name: str, values: Sequence[Any]) -> None:
-        """Sets an attribute of each environment to its value."""
+        """Sets an attribute of each environment to a value of its own."""
         self._ask("set_attr", [(name, [values[i] for i in part]) for part in self._parts])
 
     def close(self) -> None:
-        """Ends the processes; one that still works after ten seconds is killed."""
+        """Ends the processes, and kills those that do not end within ten seconds."""
         for pipe in self._pipes:
             pipe.close()
         for process in self.processes:
@@ -259,11 +248,11 @@ class ProcessVectorEnv:
                 process.join(GRACE)
 
     def _ask(self, what: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Returns the answers of all processes, which work at the same time.
+        """Calls a method in all processes at the same time, and returns their answers.
 
         Raises:
-            Exception: what the first environment that failed has raised.
-            LostProcessError: if a process answers no more.
+            Exception: of the first environment that fails.
+            LostProcessError: if a process has ended.
         """
         try:
             for pipe, given in zip(self._pipes, arguments, strict=True):
@@ -283,8 +272,13 @@ class ProcessVectorEnv:
         return [answer for _, answer in answers]
 
 
+def _joined(answers: list[Any]) -> Any:
+    """Returns the arrays in the answers of all processes, joined in their places."""
+    return tree_map(lambda *each: np.concatenate(each), *answers)
+
+
 def _player(registered: gymnasium.envs.registration.EnvSpec | None, *given: Any) -> LevelPlayer:
-    """Returns a player, also in a process that does not know the environment's name yet."""
+    """Returns a player, also in a process in which the environment is not registered yet."""
     if registered is not None:
         gymnasium.registry.setdefault(registered.id, registered)
     return LevelPlayer(*given)
@@ -292,7 +286,7 @@ def _player(registered: gymnasium.envs.registration.EnvSpec | None, *given: Any)
 
 @contextmanager
 def _without_script() -> Iterator[None]:
-    """Starts processes that do not run the script again, which may have no ``__main__`` guard."""
+    """Keeps new processes from running the script again, which may have no ``__main__`` guard."""
     with _STARTING:
         script = sys.modules["__main__"]
         sys.modules["__main__"] = ModuleType("__main__")
@@ -303,8 +297,8 @@ def _without_script() -> Iterator[None]:
 
 
 def _serve(pipe: Connection) -> None:
-    """Steps environments until the pipe is closed, or the parent is gone."""
-    # The parent is asked to stop by these, and saves its work first; this process ends with it.
+    """Steps environments until the pipe is closed or the parent has ended."""
+    # These ask the parent to stop, which saves its work first; this process ends with the parent.
     for name in ("SIGINT", "SIGHUP", "SIGUSR1", "SIGUSR2"):
         if hasattr(signal, name):  # Windows has the first alone
             signal.signal(getattr(signal, name), signal.SIG_IGN)
@@ -312,7 +306,7 @@ def _serve(pipe: Connection) -> None:
     torch.set_num_threads(1)  # there are as many processes as cores
     env: Any = None
     seen = None
-    with suppress(EOFError, OSError):  # the pipe's; the environments' are answers
+    with suppress(EOFError, OSError):  # of the pipe; those of environments are answers
         while True:
             what, given = pipe.recv()
             try:
@@ -324,6 +318,9 @@ def _serve(pipe: Connection) -> None:
                     if given[0] is None or given[0]["reset_mask"].any():
                         seen = env.reset(options=given[0])[0]
                     answer = seen
+                elif what == "step":
+                    *answer, info = env.step(*given)
+                    answer.append({"success": info.get("success", np.zeros_like(answer[-1]))})
                 else:
                     answer = getattr(env, what)(*given)
                 failed = False

@@ -1,4 +1,4 @@
-"""Sets the parameters of Gymnasium's CartPole that are no plain attributes."""
+"""Sets parameters of Gymnasium's CartPole from which it computes others."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from typing import Any
 
 
 def set_length(environment: Any, length: float) -> None:
-    """Sets half the pole's length, in metres, and what CartPole computes from it once.
+    """Sets half the pole's length, and the product with its mass that CartPole keeps.
 
     Args:
         environment: ``CartPole-v1`` without wrappers.
-        length: half of the pole's.
+        length: half of the pole's, in metres.
     """
     environment.length = length
     environment.polemass_length = environment.masspole * length

@@ -1,4 +1,4 @@
-"""The Solver's network, from what an environment shows and takes."""
+"""Networks of Solvers for any observations and actions: MLPs, CNNs and LSTMs."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from proposer_rl.models.population import StackedLinear
 from proposer_rl.settings import settings
 from proposer_rl.tasks.gymnasium.spaces import channels_first
 
-SMALL_MAP = 8  # pixels along its shorter side at most: no more is halved
-LARGE_MAP = 36  # pixels along it, from which on the strides are those for screens
-# Kernel and stride of convolutions of screens (Mnih et al. 2015, "Human-level control through deep
-# reinforcement learning"); further ones are as the last.
+SMALL_MAP = 8  # an image with a shorter side of at most so many pixels is not halved
+LARGE_MAP = 36  # from so many pixels on it gets the strides for screens
+# Kernels and strides for screens (Mnih et al. 2015, "Human-level control through deep reinforcement
+# learning"); further convolutions are like the last.
 SCREEN = ((8, 4), (4, 2), (3, 1))
 WIDTHS, SCREEN_WIDTHS = (16, 32), (32, 64, 64)
 FIRST_LOG_SCALE = -0.5  # of the policy over continuous actions
 POLICY_GAIN = 0.01  # of the policy's last layer: the first policy is nearly uniform
-NEVER = -1e9  # logit of an action that there is not
+NEVER = -1e9  # logit of an action that does not exist
 
 
 Widths = list[Annotated[int, Ge(1)]]
@@ -33,15 +33,15 @@ Widths = list[Annotated[int, Ge(1)]]
 
 @settings
 class NetworkSettings:
-    """The Solver's network: an MLP of numbers, a CNN of images.
+    """Settings of the Solver's network: an MLP for numbers, a CNN for images.
 
     Attributes:
-        hidden: widths of the hidden layers, of the policy and of the critic.
-        channels: of the convolutions before them, for images; None for what their size asks for.
-        scale: observations are multiplied with it; None for 1, and 1/255 of bytes.
-        image: order of an image's axes; None for what its shape tells.
-        memory: width of an LSTM between what is seen and the heads, which then have one hidden
-            layer, of the last width; None for no memory.
+        hidden: widths of the hidden layers of policy and critic.
+        channels: of the convolutions for images; None to choose them by the images' size.
+        scale: factor of observations; None for 1, and 1/255 for bytes.
+        image: order of an image's axes; None to tell it by the shape.
+        memory: width of an LSTM before the heads, which then have one hidden layer, of the last
+            width; None for no memory.
     """
 
     hidden: Annotated[Widths, Len(1)]
@@ -52,12 +52,12 @@ class NetworkSettings:
 
 
 class SolverNetwork(nn.Module):
-    """Policy and critic: two MLPs of numbers, and of images after convolutions that they share.
+    """Policy and critic: two MLPs, for images after convolutions that they share.
 
     Args:
-        seen: specs of what is seen, without a batch: numbers [D] or images of three axes.
-        acts: spec of one of n actions, of several of n each, or of D numbers, whose policy is
-            normal, with a scale that is learnt and does not depend on what is seen.
+        seen: specs of the observations, without a batch: numbers [D] or images of three axes.
+        acts: spec of the actions: one of n, one of n for each of several choices, or D numbers
+            with a normal policy, whose learnt scale does not depend on the observation.
         settings: widths, and the observations' scale.
     """
 
@@ -81,10 +81,7 @@ class SolverNetwork(nn.Module):
 def solver_network(
     seen: Sequence[TensorSpec], acts: TensorSpec, settings: NetworkSettings
 ) -> SolverNetwork | MemoryNetwork:
-    """Returns a :class:`SolverNetwork`, or a network with memory if the settings have one.
-
-    That is numbers and images, an LSTM, then one hidden layer for each head.
-    """
+    """Returns a :class:`SolverNetwork`, or with ``memory`` a network with an LSTM."""
     if settings.memory is None:
         return SolverNetwork(seen, acts, settings)
     encoder, actions = Encoder(seen, settings), ActionLogits(acts)
@@ -100,7 +97,7 @@ def solver_network(
 
 
 class Encoder(nn.Module):
-    """Makes F ``features`` of what is seen: numbers as they are, images through convolutions."""
+    """Makes F ``features`` of observations: numbers as they are, images by convolutions."""
 
     def __init__(self, seen: Sequence[TensorSpec], settings: NetworkSettings) -> None:
         super().__init__()
@@ -108,7 +105,7 @@ class Encoder(nn.Module):
             settings.scale or (1 / 255 if spec.dtype == torch.uint8 else 1.0) for spec in seen
         ]
         self.convolutions = nn.ModuleList()
-        self._first: list[bool | None] = []  # whether an image's channels are; None of numbers
+        self._first: list[bool | None] = []  # whether an image's channels are; None for numbers
         self.features = 0
         for spec in seen:
             shape = spec.shape
@@ -137,20 +134,20 @@ class Encoder(nn.Module):
 
 
 class ActionLogits(nn.Module):
-    """Makes logits of a policy's numbers [*B, O].
+    """Makes logits of a policy's outputs [*B, O].
 
     They are [*B, n] for one of n actions, [*B, D, n] for D choices among at most n each, and
     [*B, D, 2] for D numbers: their locations and log-scales.
 
     Attributes:
-        numbers: how many a policy has to give, O.
+        numbers: count O of the policy's outputs.
     """
 
     def __init__(self, acts: TensorSpec) -> None:
         super().__init__()
         self._choices: list[int] | None = None
         self.log_scale: nn.Parameter | None = None
-        if isinstance(acts, MultiCategorical):  # which is a Categorical, too
+        if isinstance(acts, MultiCategorical):  # a subclass of Categorical
             self._choices = acts.nvec.tolist()
             self.numbers = sum(self._choices)
         elif isinstance(acts, Categorical):
@@ -160,7 +157,7 @@ class ActionLogits(nn.Module):
             self.log_scale = nn.Parameter(torch.full((self.numbers,), FIRST_LOG_SCALE))
 
     def forward(self, numbers: Tensor) -> Tensor:
-        """Returns the logits of a policy's numbers [*B, O]."""
+        """Returns the logits of a policy's outputs [*B, O]."""
         if self.log_scale is not None:
             between = [1] * (numbers.ndim - self.log_scale.ndim)
             scale = self.log_scale.unflatten(-1, (*between, -1))  # [K, D] of stacked replicas
@@ -173,9 +170,10 @@ class ActionLogits(nn.Module):
 
 
 def _convolutions(channels: int, side: int, widths: Sequence[int] | None) -> nn.Sequential:
-    """Returns convolutions, those of screens where a map is as large as one.
+    """Returns convolutions for images with a shorter side of so many pixels.
 
-    Others are 3x3, with a stride of 2 as long as the map is not small.
+    Those of large images are as for screens; others are 3x3, with a stride of 2 until the map is
+    small.
     """
     screen = side >= LARGE_MAP
     layers: list[nn.Module] = []

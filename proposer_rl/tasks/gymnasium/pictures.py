@@ -1,11 +1,11 @@
-"""Pictures of levels: the environment's own frames along a Solver's first episode."""
+"""Draws levels as the environment's own frames along a Solver's first episode."""
 
 from __future__ import annotations
 
 import os
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +24,7 @@ from proposer_rl.tasks.gymnasium.player import (
 )
 from proposer_rl.tasks.parameters import SEED
 
-# Of pygame, with which most environments draw: no greeting, and no window or sound is needed.
+# Most environments draw with pygame: no greeting, no window and no sound.
 for name, value in {
     "PYGAME_HIDE_SUPPORT_PROMPT": "1",
     "SDL_VIDEODRIVER": "dummy",
@@ -36,30 +36,28 @@ MODE = "rgb_array"
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
 LONGER_SIDE = 150  # pixels
 LATER = 3  # moments of an episode that are drawn over its start
-FRAMES = "The environment's frames: the start, and more faintly three later moments of the episode."
+FRAMES = "The environment's frames: the start, and fainter three later moments of the episode."
 NO_FRAMES = "The environment draws no frames here; the numbers are those of the level."
 
 
 class Camera:
-    """Plays levels again, with the actions that a Solver took, and takes pictures.
+    """Replays levels with the actions that a Solver took, and takes pictures.
 
     Attributes:
-        works: whether there are frames: the environment can draw, and has what it needs for it.
+        works: whether the environment can draw frames, and has the packages and drivers for it.
     """
 
     def __init__(
         self, make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: GymLevel
     ) -> None:
-        try:
-            if MODE not in LevelPlayer(make, parameters, play).metadata["render_modes"]:
-                raise ValueError("it draws nothing")
-            drawing = {**make.arguments, "render_mode": MODE}  # which not every constructor takes
-            self._player = LevelPlayer(replace(make, arguments=drawing), parameters, play)
-            self._player.reset()
-            self._frame()
-            self.works = True
-        except Exception:  # a package, a display, a driver: the numbers are shown instead
-            self.works = False
+        self.works = False
+        with suppress(Exception):  # a package, a display, a driver: the numbers are shown instead
+            if MODE in LevelPlayer(make, parameters, play).metadata["render_modes"]:
+                drawing = {**make.arguments, "render_mode": MODE}
+                self._player = LevelPlayer(replace(make, arguments=drawing), parameters, play)
+                self._player.reset()
+                self._frame()
+                self.works = True
 
     def picture(self, play: GymLevel, actions: Tensor | None) -> NDArray[np.uint8]:
         """Draws a level, and an episode there with actions [T, ...]: uint8 [H, W, 3]."""
@@ -88,18 +86,16 @@ class Camera:
     def _frame(self) -> NDArray[np.uint8]:
         with _without_display():
             frame: Any = self._player.render()
-        if not (isinstance(frame, np.ndarray) and frame.dtype == np.uint8 and frame.ndim == 3):
-            raise TypeError("render must return bytes [H, W, 3]")
-        image = Image.fromarray(frame)
+        image = Image.fromarray(frame).convert("RGB")
         image.thumbnail((LONGER_SIDE, LONGER_SIDE))
         return np.asarray(image)
 
 
 @contextmanager
 def _without_display() -> Iterator[None]:
-    """Lets MuJoCo draw by EGL meanwhile, where there is no display and nobody has said how.
+    """Lets MuJoCo draw with EGL where there is no display and no setting for it.
 
-    It is undone, because without EGL a new process could not even import MuJoCo.
+    The setting is undone: without EGL a new process could not even import MuJoCo.
     """
     if sys.platform != "linux" or any(map(os.environ.get, DISPLAYS)):
         yield

@@ -1,4 +1,4 @@
-"""Spaces as Solvers' networks take them: numbers, images, and actions in one tensor."""
+"""Converts between Gymnasium's spaces and the tensors of a Solver's network."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from torch import Tensor
 from torchrl.data import Categorical, MultiCategorical, TensorSpec, Unbounded
 
 from proposer_rl.settings import shown
-from proposer_rl.tasks.gymnasium.answers import UnfitEnvironmentError
+from proposer_rl.tasks.gymnasium.environment import UnfitEnvironmentError
 
-# Spaces whose values are one number or an array of them.
+# Spaces whose values are a number or an array of numbers.
 NUMERIC = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
-UNBOUNDED = 1e9  # what a bound of at least this means; no number in use comes near
-IMAGE_SIDE = 16  # pixels at least, of a map of bytes without channels
+UNBOUNDED = 1e9  # a bound of at least this size means that there is none
+IMAGE_SIDE = 16  # least side, in pixels, of an image without channels
 NUMBERS_ENTRY = "observation"  # the entry of all numbers, or of the only image
 
 
 class Layout:
-    """Turns what environments show into tensors, and a Solver's actions into what they take.
+    """Converts observations to tensors, and a Solver's actions to those of the environment.
 
-    Observations become numbers [D], where whole numbers to choose from are one-hot, or an image of
-    three axes. Where both are seen, or several images, there are several entries: the numbers by
-    the name of ``observation``, each image by its own after ``image``.
+    Observations become numbers [D], in which discrete ones are one-hot, or an image of three axes.
+    If there are numbers and images, or several images, they become several entries: the numbers
+    under ``observation``, and each image under ``image`` and its own name.
 
-    Actions become one of n, one of several n each, or numbers [D] whose bounded parts go from -1 to
-    1; what is beyond a bound is clipped.
+    Actions become one of n, one of n for each of several parts, or numbers [D], of which bounded
+    ones go from -1 to 1. What is beyond a bound is clipped.
 
     Args:
         observation_space, action_space: of one environment.
@@ -40,7 +40,7 @@ class Layout:
         acts: spec of the actions.
 
     Raises:
-        UnfitEnvironmentError: for spaces that no network is for, saying what there is one for.
+        UnfitEnvironmentError: for a space that networks or policies cannot handle.
     """
 
     def __init__(
@@ -49,16 +49,16 @@ class Layout:
         self.observation_space, self.action_space = observation_space, action_space
         self._parts: dict[str, Any] = {}  # in the order of the space
         for name, part in leaves(observation_space):
-            while name in self._parts:  # a.b is a name with a dot, or b in a
+            while name in self._parts:  # a.b may be a name with a dot, or b in a
                 name += "'"
             self._parts[name] = part
         for name, part in self._parts.items():
             if not isinstance(part, NUMERIC):
-                way = "; a wrapper can make numbers of it"
+                way = "; use a wrapper that makes numbers of it"
                 if name:
                     way = (
-                        f", its part {name}; a wrapper can leave it out, as wrappers="
-                        "[{gymnasium.wrappers.FilterObservation: {filter_keys: [...]}}] does"
+                        f", its part {name}; leave it out by a wrapper, as wrappers="
+                        "[{gymnasium.wrappers.FilterObservation: {filter_keys: [...]}}]"
                     )
                 raise UnfitEnvironmentError(
                     f"observation space {observation_space}: there is no network for {part}{way}"
@@ -72,10 +72,10 @@ class Layout:
         self.acts = self._acts()
 
     def entries(self, shown: Iterable[Tensor]) -> dict[str, Tensor]:
-        """Returns what a Solver sees: float32, or uint8 of bytes, [*B, ...] by name.
+        """Returns a Solver's observations by entry, float32, or uint8 of bytes, [*B, ...].
 
         Args:
-            shown: parts of observations [*B, ...], in the order of those of their space.
+            shown: parts of observations [*B, ...], in the order of the space's parts.
         """
         named = sorted(zip(self._parts.items(), shown, strict=True), key=lambda one: one[0][0])
         found, rows = {}, []
@@ -93,7 +93,7 @@ class Layout:
         return found if len(found) > 1 else {NUMBERS_ENTRY: next(iter(found.values()))}
 
     def own_actions(self, actions: Tensor) -> list[Tensor]:
-        """Returns the parts of the space's actions, [*B, ...] each, from a Solver's."""
+        """Returns the parts of the environment's actions, [*B, ...] each, from a Solver's."""
         rows = actions.unsqueeze(-1) if isinstance(self.action_space, spaces.Discrete) else actions
         parts = rows.split([taken.size for taken in self._taken], -1)
         return [taken(row) for taken, row in zip(self._taken, parts, strict=True)]
@@ -113,18 +113,18 @@ class Layout:
             counts = torch.tensor([count for part in parts for count in _options(part)])
             return MultiCategorical(counts, shape=counts.shape)  # also of a single choice
         raise UnfitEnvironmentError(
-            f"action space {space}: there is a policy for a Discrete, a MultiDiscrete or a "
-            "MultiBinary one, for a Box of floats, and for dictionaries and tuples of either; a "
-            "wrapper can make it one"
+            f"action space {space}: there is a policy for Discrete, MultiDiscrete and MultiBinary "
+            "spaces, for a Box of floats, and for dictionaries and tuples of either kind; use a "
+            "wrapper that makes it one of these"
         )
 
 
 class PartTaken:
-    """Makes actions of a part of an action space from numbers of -1 to 1, or choices from 0 on.
+    """Converts numbers from -1 to 1, or choices from 0, to actions of a part of an action space.
 
     Attributes:
         part: the space.
-        size: how many numbers or choices there are.
+        size: count of the numbers or choices.
     """
 
     def __init__(self, part: Any) -> None:
@@ -149,22 +149,22 @@ class PartTaken:
         return own.to(self._dtype)
 
 
-def typed(space: Any, seen: Any) -> Any:
-    """Returns an observation whose numbers have the types of its space, in its order.
+def cast_to(space: Any, seen: Any) -> Any:
+    """Returns an observation in the dtypes and in the order of its space.
 
     Raises:
-        UnfitEnvironmentError: where a part has another shape, or would become another number. A
-            float beyond its bounds does not: nothing here depends on them.
+        UnfitEnvironmentError: if a part has another shape, or its numbers would change. Floats may
+            lie beyond the bounds, on which nothing depends here.
     """
     if isinstance(space, spaces.Dict):
-        return {name: typed(part, seen[name]) for name, part in space.spaces.items()}
+        return {name: cast_to(part, seen[name]) for name, part in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
-        return tuple(typed(part, one) for part, one in zip(space.spaces, seen, strict=True))
+        return tuple(cast_to(part, one) for part, one in zip(space.spaces, seen, strict=True))
     if not isinstance(space, NUMERIC):
         return seen
     array = np.asarray(seen)
     fits = array.shape == space.shape and array.dtype.kind in "biuf"
-    # Floats of a box are not looked at one by one: that would take longer than many a step.
+    # Floats of a box are not compared one by one, which would take longer than many a step.
     floats = array.dtype.kind == "f" == space.dtype.kind
     if fits and not (isinstance(space, spaces.Box) and (floats or array.dtype == space.dtype)):
         with np.errstate(invalid="ignore"):
@@ -179,7 +179,7 @@ def typed(space: Any, seen: Any) -> Any:
 
 
 def is_image(space: spaces.Space[Any]) -> bool:
-    """Returns whether a space is of images: three axes or four, or two of bytes and not short."""
+    """Returns whether a space has images: of three or four axes, or of two long ones of bytes."""
     if not isinstance(space, spaces.Box):
         return False
     bytes_ = space.dtype == np.uint8 and min(space.shape, default=0) >= IMAGE_SIDE
@@ -187,12 +187,12 @@ def is_image(space: spaces.Space[Any]) -> bool:
 
 
 def channels_first(shape: tuple[int, ...]) -> bool:
-    """Returns whether the channels of an image are its first axis, or else its last.
+    """Returns whether the channels of an image are its first axis, and not its last.
 
-    They are the axis that differs where the other two are alike, or else the shortest.
+    They are the axis that differs if the other two are alike, and else the shortest.
 
     Raises:
-        ValueError: where the shape does not tell.
+        ValueError: if the shape does not tell.
 
     Example:
         >>> channels_first((4, 84, 84)), channels_first((7, 7, 20)), channels_first((20, 24, 3))
@@ -204,12 +204,12 @@ def channels_first(shape: tuple[int, ...]) -> bool:
     if first != last and min(first, last) < middle:
         return first < last
     raise ValueError(
-        f"images {list(shape)}: which axis are the channels? Say network.image=HWC or CHW"
+        f"images {list(shape)}: which axis has the channels? Set network.image=HWC or CHW"
     )
 
 
 def _row(seen: Tensor, space: Any) -> Tensor:
-    """Returns numbers [*B, ...] of a space in a row [*B, D], choices one-hot."""
+    """Returns numbers [*B, ...] of a space as rows [*B, D], with discrete ones one-hot."""
     row = seen.reshape(*seen.shape[: seen.ndim - len(space.shape)], -1)
     if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
         return row
@@ -219,7 +219,7 @@ def _row(seen: Tensor, space: Any) -> Tensor:
 
 
 def _options(space: Any) -> list[int]:
-    """Returns how many options each choice has."""
+    """Returns the number of options of each choice."""
     if isinstance(space, spaces.MultiBinary):
         return [2] * math.prod(space.shape)
     counts: list[int] = np.ravel(getattr(space, "nvec", getattr(space, "n", 0))).tolist()
@@ -238,7 +238,7 @@ def _of_three_axes(image: Tensor, box: spaces.Box) -> Tensor:
 
 
 def leaves(whole: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields parts of a space or an observation below dictionaries and tuples, by dotted names."""
+    """Yields the parts in nested dictionaries and tuples, with their dotted names."""
     if isinstance(whole, Mapping | tuple | spaces.Tuple):  # a space of dictionaries is a Mapping
         for part, inner in whole.items() if isinstance(whole, Mapping) else enumerate(whole):
             yield from leaves(inner, f"{name}.{part}" if name else str(part))
@@ -247,7 +247,7 @@ def leaves(whole: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def in_order(space: spaces.Space[Any], seen: Any) -> Iterator[Any]:
-    """Yields the parts of an observation, in the order of those of its space."""
+    """Yields the parts of an observation in the order of its space's parts."""
     if isinstance(space, spaces.Dict):
         for name, inner in space.spaces.items():
             yield from in_order(inner, seen[name])
@@ -259,7 +259,7 @@ def in_order(space: spaces.Space[Any], seen: Any) -> Iterator[Any]:
 
 
 def assembled(space: spaces.Space[Any], values: Iterator[Any]) -> Any:
-    """Returns a value of a space from those of its parts, in order."""
+    """Returns a value of a space, put together from the values of its parts in order."""
     if isinstance(space, spaces.Dict):
         return {name: assembled(inner, values) for name, inner in space.spaces.items()}
     if isinstance(space, spaces.Tuple):

@@ -1,7 +1,7 @@
-"""Gymnasium's BipedalWalker on a track of stumps, of some height and with some space in between.
+"""Gymnasium's BipedalWalker on a track of stumps of some height and spacing.
 
-Portelas et al. 2019 (arXiv 1910.07224) made such tracks from Gym's walker; here the grass is that
-of Gymnasium's, and stumps of one width stand on it.
+Portelas et al. 2019 (arXiv 1910.07224) made such tracks from Gym's walker. Here stumps of one width
+stand on the grass of Gymnasium's.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ GREY = (255, 255, 255), (153, 153, 153)
 
 
 class BipedalStumps(BipedalWalker):  # type: ignore[misc, unused-ignore]
-    """BipedalWalker on a track of stumps, which is laid at every reset.
+    """BipedalWalker on a track of stumps that every reset lays anew.
 
     Args:
-        render_mode: as of :class:`gymnasium.Env`.
+        render_mode: as in :class:`gymnasium.Env`.
 
     Attributes:
-        stump_height: in metres of Box2D's; 0 for none.
-        stump_spacing: between two of them.
+        stump_height: in Box2D's metres; 0 for no stumps.
+        stump_spacing: free ground between two stumps, in metres.
     """
 
     def __init__(self, render_mode: str | None = None) -> None:
@@ -39,7 +39,7 @@ class BipedalStumps(BipedalWalker):  # type: ignore[misc, unused-ignore]
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode in a new world, as a used one keeps an order of its contacts."""
+        """Begins an episode in a new world, since a used one keeps an order of contacts."""
         self._destroy()
         self.world = Box2D.b2World()
         return super().reset(seed=seed, options=options)

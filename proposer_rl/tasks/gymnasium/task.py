@@ -1,4 +1,4 @@
-"""Any Gymnasium environment as a task: Solvers, levels and how they are measured."""
+"""Trains and measures Solvers in any Gymnasium environment."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from proposer_rl.runs.records import png
 from proposer_rl.settings import settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
-from proposer_rl.tasks.gymnasium.answers import SuccessSettings, UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.batched_env import FLAGS, GymnasiumEnv, Vectorization, plays
+from proposer_rl.tasks.gymnasium.environment import SuccessSettings, UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork, solver_network
 from proposer_rl.tasks.gymnasium.pictures import FRAMES, NO_FRAMES, Camera
 from proposer_rl.tasks.gymnasium.player import (
@@ -39,20 +39,20 @@ from proposer_rl.tasks.gymnasium.player import (
     WrapperSettings,
     cause,
 )
-from proposer_rl.tasks.gymnasium.trial import tried
+from proposer_rl.tasks.gymnasium.trial import check_environment
 from proposer_rl.tasks.parameters import LARGEST_SEED, SEED, ParameterSpace
 from proposer_rl.tasks.ranges import spaces
 
 
 @settings
 class EvaluationSettings:
-    """Settings of how Solvers are measured: by episodes.
+    """Settings of evaluations, which play episodes.
 
     Attributes:
         levels: of each distribution, the same in every run.
-        episodes: played on each level, with drawn actions: the most probable ones make the same
-            episode every time, since each begins with the level's own seed.
-        actions: drawn from the policy, or the most probable ones.
+        episodes: played on each level. More than one is of use only with sampled actions: each
+            begins with the level's own seed, so that the most probable ones repeat it.
+        actions: sampled from the policy, or the most probable ones.
         seed: of the levels and of the actions.
     """
 
@@ -63,35 +63,35 @@ class EvaluationSettings:
 
 
 class GymnasiumTask(Task):
-    """An environment of Gymnasium some of whose settings make a level.
+    """Any Gymnasium environment, in which settings such as gravity make a level.
 
     Gymnasium's vector environments step it on the CPU; levels, states and Solvers are on the
     context's device.
 
     Args:
-        env_id: as :func:`gymnasium.make` takes it; ``module:name`` imports the module first.
+        env_id: as in :func:`gymnasium.make`; ``module:name`` imports the module first.
         arguments: of the environment's constructor.
-        wrappers: functions or classes that are put around each environment, the innermost first:
-            dotted names, or one with its further arguments.
-        max_steps: after which an episode is truncated; None for the environment's own limit.
+        wrappers: dotted names of functions or classes to put around each environment, the innermost
+            first; or mappings from such a name to further arguments.
+        max_steps: step limit of an episode; None for the environment's own.
         parameters: what differs between levels, by name.
-        success: when an episode is one.
-        reward_scale: what rewards are multiplied with in training; returns are given without it.
-        network: of the Solver.
+        success: when an episode is a success.
+        reward_scale: factor of the rewards in training; returns are reported without it.
+        network: the Solver's network.
         evaluation: how the Solver is measured.
-        vectorization: of the environments: ``"sync"``, or ``"async"`` for as many processes as
-            there are cores.
-        extra: of this package, that the environment needs; None for none.
+        vectorization: ``"sync"`` steps the environments one after another, ``"async"`` in as many
+            processes as there are cores.
+        extra: of this package, which the environment needs; None for none.
         solver: the Solver's training.
         context: device, precision and cores.
-        transforms: TorchRL's, of the environments as one; those that change the reward only in
+        transforms: TorchRL's, of the batch of environments; those of the reward apply only in
             training.
-        train_seeds: number of seeds of the levels that are trained on; ``target`` and ``all`` are
-            then measured on others, and ``train`` on those. None for any seed.
+        train_seeds: count of seeds in training. ``target`` and ``all`` are then measured on other
+            seeds, and ``train`` on those of the training. None for any seed in all of them.
 
     Raises:
-        ValueError: naming the key, if there is no such environment or parameter, it refuses a value
-            of a parameter, there is no network for what it shows or takes, or a package is missing.
+        ValueError: naming the key, if the environment cannot be made, a parameter cannot be set,
+            no network fits the spaces, or a package is missing.
     """
 
     episodes_at_once = 64
@@ -150,10 +150,12 @@ class GymnasiumTask(Task):
         first = self.evaluated_on["target"][:1]
         (self._first,) = plays(first, parameters)
         with _named(env_id, extra):
-            self.max_steps = tried(self._make, parameters, space.bins, self._first, success)
+            self.max_steps = check_environment(
+                self._make, parameters, space.bins, self._first, success
+            )
         self._seen, self._acts = self._specs(first)
         self.observed, self.memory = list(self._seen), network.memory
-        # MLPs as small as these are faster all at once.
+        # Small MLPs of several Solvers are faster together.
         small = all(spec.ndim == 1 for spec in self._seen.values())
         self.batched = True if small and network.memory is None else None
         self._measured = {
@@ -167,18 +169,18 @@ class GymnasiumTask(Task):
 
     @property
     def target_shares(self) -> Tensor:
-        """Returns the target's shares in bins, float [N]; what lies outside is in the nearest."""
+        """Returns the target's share in each bin, or nearest to it outside of all: float [N]."""
         shares: Tensor = self.space.shares(self.target)
         return shares
 
     @property
     def key(self) -> str:  # type: ignore[override]
-        """Returns what is to be seen in a record's picture."""
+        """Returns a description of a record's picture."""
         return FRAMES if self._camera.works else NO_FRAMES
 
     @property
     def about(self) -> dict[str, str]:
-        """Returns texts about the task, by their labels."""
+        """Returns facts about the task for readers, by their labels."""
         evaluation = self._evaluation
         return {
             "Environment": f"{self.title}, at most {self.max_steps} steps",
@@ -190,11 +192,11 @@ class GymnasiumTask(Task):
         }
 
     def environment(self, levels: TensorDictBase) -> EnvBase:
-        """Returns environments to be trained in."""
+        """Returns environments for training."""
         return self._env(levels, self._transforms, vectorization=self._vectorization)
 
     def evaluation_environment(self, levels: TensorDictBase) -> EnvBase:
-        """Returns environments that play each level once; those of a batch shape are kept."""
+        """Returns environments that play each level once, and are reused for a batch shape."""
         shape = levels.batch_size
         if shape not in self._envs:
             self._envs[shape] = self._env(
@@ -204,11 +206,11 @@ class GymnasiumTask(Task):
         return self._envs[shape]
 
     def network(self) -> nn.Module:
-        """Returns the network of one Solver, by what the environment shows and takes."""
+        """Returns the network of one Solver for the environment's spaces."""
         return solver_network(list(self._seen.values()), self._acts, self._network)
 
     def evaluation_distribution(self, name: str) -> ParameterSpace:
-        """Returns a distribution, of other seeds than the training's."""
+        """Returns a distribution, with other seeds than the training if it has seeds of its own."""
         return self._test.get(name, self.distributions[name])
 
     def stream(self, use: str, name: str) -> torch.Generator:
@@ -240,10 +242,10 @@ class GymnasiumTask(Task):
         ]
 
     def own_spaces(self) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any]]:
-        """Returns the environment's own spaces, of observations behind its wrappers and of actions.
+        """Returns the spaces of observations and actions of one environment with its wrappers.
 
         Raises:
-            ValueError: if transforms change what the Solver sees or does.
+            ValueError: if transforms change what the Solver observes or does.
         """
         if self._unpaid():
             raise ValueError(
@@ -278,10 +280,10 @@ class GymnasiumTask(Task):
         )
 
     def _specs(self, level: TensorDictBase) -> tuple[dict[str, TensorSpec], TensorSpec]:
-        """Returns specs of what Solvers see and do after the transforms, and tries the network.
+        """Returns specs of observations and actions after the transforms, and tries the network.
 
         Raises:
-            ValueError: naming the key, where there is no network for them.
+            ValueError: naming the key, if no network fits them.
         """
         key = "transforms" if self._transforms else "network"
         try:
@@ -295,16 +297,15 @@ class GymnasiumTask(Task):
         return seen, acts
 
 
-OWN_MOMENTS = (
-    "it keeps running statistics, other ones in evaluations: take PPO's normalize_observations and "
-    "normalize_rewards"
-)
-# What would mislead: it trains on something else than what is measured, or never ends an episode.
+# These would silently train on something other than what is measured, or miss an episode's end.
 MISLEADING: dict[type[Transform], str] = {
-    envs.VecNorm: OWN_MOMENTS,
-    envs.VecNormV2: OWN_MOMENTS,
-    envs.FrameSkipTransform: "it steps on beyond an episode's end: take one of wrappers",
-    envs.StepCounter: "the environment does not see its max_steps: take the task's",
+    **dict.fromkeys(
+        (envs.VecNorm, envs.VecNormV2),
+        "it keeps running statistics, other ones in evaluations; use PPO's "
+        "normalize_observations and normalize_rewards",
+    ),
+    envs.FrameSkipTransform: "it steps on beyond an episode's end; use one of wrappers",
+    envs.StepCounter: "the environment does not see its max_steps; use the task's",
 }
 
 
@@ -312,7 +313,7 @@ def _checked_transforms(transforms: Iterable[Any]) -> Iterator[Transform]:
     """Yields the transforms one by one, also those of a Compose.
 
     Raises:
-        ValueError: for what is none, keeps running statistics, or mistakes where episodes end.
+        ValueError: if one is no transform, keeps running statistics, or misses an episode's end.
     """
     for one in transforms:
         if isinstance(one, envs.Compose):
@@ -320,33 +321,28 @@ def _checked_transforms(transforms: Iterable[Any]) -> Iterator[Transform]:
             continue
         why = next((why for kind, why in MISLEADING.items() if isinstance(one, kind)), "")
         if not isinstance(one, Transform):
-            why = "must be a transform of TorchRL's, as {_target_: torchrl.envs.StepCounter}"
+            why = "must be a transform of TorchRL, as {_target_: torchrl.envs.RewardClipping}"
         if why and getattr(one, "max_steps", True) is not None:  # a StepCounter may only count
             raise ValueError(f"transforms: {type(one).__name__}: {why}")
         yield one
 
 
 def _copied(transform: Transform) -> Transform:
-    """Returns a copy for another environment; deepcopy takes no buffers without a shape."""
+    """Returns a copy for another environment; deepcopy fails on buffers without a shape."""
     copy: Transform = pickle.loads(pickle.dumps(CloudpickleWrapper(transform))).fn
     return copy
 
 
 @contextmanager
 def _named(env_id: str, extra: str | None) -> Iterator[None]:
-    """Says in one line what is wrong with an environment that cannot be made."""
+    """Puts the key before errors of an environment, and says how to install a missing package."""
     try:
         yield
-    except (ImportError, gymnasium.error.DependencyNotInstalled) as error:
-        how = f"install it with: {install_command(extra)}" if extra else "install it"
-        reason = " ".join(str(error).split())
-        if not extra and (own := where_to_look(error)):
-            raise ValueError(f"env_id={env_id}: {reason}{own}") from error
-        raise ValueError(f"env_id={env_id}: a package is missing; {how} ({reason})") from error
-    except gymnasium.error.Error as error:
-        unknown = isinstance(error, gymnasium.error.NameNotFound) and ":" not in env_id
-        own = "; one's own comes after its module, as module:Name-v0" if unknown else ""
-        raise ValueError(f"env_id={env_id}: {str(error).rstrip('.')}{own}") from error
-    except UnfitEnvironmentError as error:
-        own_key = str(error).startswith(("success.", "parameters", "wrappers"))
-        raise ValueError(str(error) if own_key else f"env_id={env_id}: {error}") from error
+    except (ImportError, gymnasium.error.Error, UnfitEnvironmentError) as error:
+        said = " ".join(str(error).split()).rstrip(".")
+        if isinstance(error, ImportError | gymnasium.error.DependencyNotInstalled):
+            said += f"; install with: {install_command(extra)}" if extra else where_to_look(error)
+        elif isinstance(error, gymnasium.error.NameNotFound) and ":" not in env_id:
+            said += "; for your own environment, name its module first, as in module:Name-v0"
+        has_key = said.startswith(("success.", "parameters", "wrappers"))
+        raise ValueError(said if has_key else f"env_id={env_id}: {said}") from error

@@ -1,4 +1,4 @@
-"""A trial before anything is trained: Gymnasium's check, wrappers, levels and successes."""
+"""Tries an environment before training: Gymnasium's check, wrappers, levels and successes."""
 
 from __future__ import annotations
 
@@ -9,52 +9,49 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from proposer_rl.tasks.gymnasium.answers import SuccessSettings
+from proposer_rl.tasks.gymnasium.environment import SuccessSettings
 from proposer_rl.tasks.gymnasium.pictures import Camera
 from proposer_rl.tasks.gymnasium.player import (
     GymLevel,
     LevelPlayer,
     MakeEnvironment,
     ParameterSettings,
-    wrapper_error,
+    time_limits,
 )
-from proposer_rl.tasks.gymnasium.spaces import PartTaken, assembled, leaves
+from proposer_rl.tasks.gymnasium.spaces import leaves
 from proposer_rl.tasks.parameters import Bins
 from proposer_rl.tasks.ranges import Labelled, value_text
 
 SHORT = 64  # steps of an episode in which levels are compared
-RESETS = 3  # after which a level must still be there
-# What Gymnasium advises on boxes, whose actions are scaled here anyway.
+RESETS = 3  # after each of which a parameter must have its value
+# Gymnasium's advice on the bounds of boxes, to which actions are scaled here anyway.
 ADVICE = r"(?s).*(A Box .* space m\w+ value is|For Box action spaces)"
 
 
-def tried(
+def check_environment(
     make: MakeEnvironment,
     parameters: Mapping[str, ParameterSettings],
     bins: Mapping[str, Bins],
     target: GymLevel,
     success: SuccessSettings,
 ) -> int:
-    """Plays an episode on a level of the target, and short ones at both ends of each parameter.
+    """Checks an environment by playing it, and returns the step limit of its episodes.
 
-    At the ends of a parameter's bins all others are as in the target. Where it gets texts or
-    the like, each is tried. What Gymnasium's ``check_env`` finds is a warning.
-
-    Returns:
-        Steps of an episode at most.
+    It plays one episode on a level of the target, and short ones at both ends of each parameter,
+    with all others as in the target; of texts and the like it plays every choice. What Gymnasium's
+    ``check_env`` finds is a warning.
 
     Raises:
-        ValueError: in a line that names the key, for what cannot be made, set or read.
-        ImportError, gymnasium.error.Error: of the environment, if it cannot be made.
+        ValueError: in a line that names the setting, if something cannot be made, set or read.
+        ImportError, gymnasium.error.Error: from the environment, if it cannot be made.
     """
     _check_interface(LevelPlayer(make, parameters, target))
     _check_wrappers(make, parameters, target)
     player = LevelPlayer(make, parameters, target, success)
-    limit = make.limit(player)
-    if not limit:
+    limit = min((one._max_episode_steps for one in time_limits(player)), default=None)
+    if limit is None:
         raise ValueError("max_steps: missing: the environment has no time limit of its own")
     _check_episode(player, success, limit)
     for name, part in bins.items():
@@ -68,7 +65,7 @@ def tried(
 
 
 def _check_interface(player: LevelPlayer) -> None:
-    """Lets Gymnasium check the environment; what it cannot do with it is no reason to refuse it."""
+    """Runs Gymnasium's own check, and warns of what it finds."""
     player.reset()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ADVICE)
@@ -86,60 +83,60 @@ def _check_interface(player: LevelPlayer) -> None:
 def _check_wrappers(
     make: MakeEnvironment, parameters: Mapping[str, ParameterSettings], play: GymLevel
 ) -> None:
-    """Refuses a wrapper after which a level does not play alike twice, though it did before."""
+    """Checks that the same actions on the same level have the same results a second time.
+
+    Raises:
+        ValueError: naming the wrapper from which on they have not.
+    """
     for count in range(len(make.wrappers) + 1 if make.wrappers else 0):
-        some = replace(make, wrappers=make.wrappers[:count])
-        player = LevelPlayer(some, parameters, play)
+        player = LevelPlayer(replace(make, wrappers=make.wrappers[:count]), parameters, play)
         first, second = (list(_played(player, SHORT)) for _ in range(2))
         player.close()
-        if _same_episodes(first, second) and not hasattr(player.env, "update_running_mean"):
-            continue
-        if count:
-            raise wrapper_error(
-                make.wrappers[count - 1],
-                "it keeps running statistics or the like, or draws numbers without the seed: the "
-                "same actions on the same level can end otherwise the second time. What all "
-                "environments share is normalised by PPO's normalize_observations and "
-                "normalize_rewards",
-            )
+        keeps = hasattr(player.env, "update_running_mean")  # also of rewards that are all zero yet
+        if keeps or not _same_episodes(first, second):
+            break
+    else:
         return
+    if count:
+        raise ValueError(
+            f"wrappers: {make.wrappers[count - 1]}: with it the same actions on the same level can "
+            "have other results the second time: it keeps running statistics, or draws numbers "
+            "without the seed. To normalize, use PPO's normalize_observations and normalize_rewards"
+        )
 
 
 def _check_episode(player: LevelPlayer, success: SuccessSettings, limit: int) -> None:
-    """Plays one episode to its end, which must tell whether it was a success."""
+    """Plays one episode to its end, where the rule of success must find what it needs."""
     steps = list(_played(player, limit + 1))
     if success.kind == "survived" and steps[-1].truncated and player.in_time:
         warnings.warn(
             f"success.kind=survived: the environment cut an episode off after {len(steps)} steps, "
-            f"before the time limit of {limit}, which is no survival; if that is its own time "
-            "limit, set max_steps to it",
+            f"before the time limit of {limit}, which is no success; if it has a time limit of its "
+            "own, set max_steps to that",
             stacklevel=2,
         )
 
 
 def _check_values(player: LevelPlayer, name: str, plays: list[GymLevel]) -> None:
-    """Sets a parameter to values, and checks that they arrive, stay, and change something.
-
-    A change of the picture suffices, as it may take skill to meet what differs.
-    """
-    shown = player.observation_space, player.action_space
+    """Sets a parameter to values, and checks that they arrive, stay, and change something."""
+    spaces = player.observation_space, player.action_space
     episodes: list[list[_Played]] = []
     for play in plays:
         for seed in range(RESETS):
             player.play = play._replace(seed=play.seed + seed)
-            player.reset()
-            _refuse_strays(player, "after a reset")
+            next(_played(player, 1))
+            if (line := player.mismatches()) is not None:
+                raise ValueError(
+                    f"{line}, after a reset and a step: the environment overwrites it; set it in "
+                    "another way, such as set: option or set: call"
+                )
         player.play = play
-        episodes.append([])
-        for step in _played(player, SHORT):
-            if len(episodes[-1]) == 1:
-                _refuse_strays(player, "after a step")
-            episodes[-1].append(step)
+        episodes.append(list(_played(player, SHORT)))
         now = player.observation_space, player.action_space
-        if now != shown:
+        if now != spaces:
             raise ValueError(
-                f"parameters.{name}: all levels must show and take the same, but "
-                f"{value_text(play.values[name])} changes {shown} to {now}"
+                f"parameters.{name}: all levels must have the same spaces, but "
+                f"{value_text(play.values[name])} changes {spaces} to {now}"
             )
     ends = plays[0], plays[-1]
     first, last = (value_text(play.values[name]) for play in ends)
@@ -153,21 +150,14 @@ def _check_values(player: LevelPlayer, name: str, plays: list[GymLevel]) -> None
 
 
 def _look_alike(player: LevelPlayer, ends: Sequence[GymLevel]) -> bool:
+    """Returns whether pictures show no difference; it may take skill to meet what differs."""
     camera = Camera(player.make, player.parameters, ends[0])
     first, last = (camera.picture(play, None) for play in ends)
     return not camera.works or np.array_equal(first, last)
 
 
-def _refuse_strays(player: LevelPlayer, when: str) -> None:
-    if (line := player.mismatches()) is not None:
-        raise ValueError(
-            f"{line}, {when}: the environment sets it by itself; set it in another way, such as "
-            "set: option or set: call"
-        )
-
-
 class _Played(NamedTuple):
-    seen: Any
+    seen: list[Any]
     reward: float
     terminated: bool
     truncated: bool
@@ -175,24 +165,13 @@ class _Played(NamedTuple):
 
 def _played(player: LevelPlayer, steps: int) -> Iterator[_Played]:
     """Yields the steps of an episode of random actions, the same ones every time."""
-    numbers = np.random.default_rng(0)
-    player.action_space.seed(0)
     player.reset()
+    player.action_space.seed(0)
     for _ in range(steps):
-        parts = (_drawn(part, numbers) for _, part in leaves(player.action_space))
-        action = assembled(player.action_space, parts)
-        seen, reward, terminated, truncated, _ = player.step(action)
+        seen, reward, terminated, truncated, _ = player.step(player.action_space.sample())
         yield _Played([np.array(part) for _, part in leaves(seen)], reward, terminated, truncated)
         if terminated or truncated:
             return
-
-
-def _drawn(part: Any, numbers: np.random.Generator) -> Any:
-    """Returns an action as a new policy draws it, which for a box is a normal one."""
-    if not isinstance(part, spaces.Box):
-        return part.sample()
-    taken = PartTaken(part)
-    return taken(torch.from_numpy(numbers.normal(size=taken.size))).numpy()
 
 
 def _same_episodes(one: list[_Played], other: list[_Played]) -> bool:

@@ -1,9 +1,8 @@
-"""The maze in Gymnasium, ``proposer_rl/Maze-v0``: what ``gymnasium.make`` makes."""
+"""The maze as a Gymnasium environment, ``proposer_rl/Maze-v0``."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -13,29 +12,30 @@ from gymnasium.error import ResetNeeded
 from tensordict import TensorDictBase
 
 from proposer_rl.settings import ArgumentError, checked
-from proposer_rl.tasks.mazes.distributions import SpecificationSpace
+from proposer_rl.tasks.mazes.generation import SpecificationSpace
 from proposer_rl.tasks.mazes.levels import MOVES, Level, validate_levels
 from proposer_rl.tasks.mazes.maze_env import MazeEnv
 from proposer_rl.tasks.mazes.task import Fractions, MazeSettings, Mechanism, PathLengths
 
-LEVELS_AHEAD = 16  # levels drawn at a time: one costs almost as much as sixteen
+LEVELS_AHEAD = 16  # levels drawn at a time; one would cost almost as much
 METADATA = {"render_modes": ["rgb_array", "ansi"], "render_fps": 8}
 
-N = TypeVar("N", int, float)
 Observation = dict[str, Any]
 
 
 class SingleMaze(gymnasium.Env[Any, Any]):
-    """One maze, with a new level in every episode, and the rules of :class:`MazeEnv`.
+    """One maze with the rules of :class:`MazeEnv` and a new level in every episode.
 
-    ``reset(seed=s)`` decides all levels from then on; ``reset(options={"level": level})`` plays
-    that level, a ``Level`` or its drawing, for one episode.
+    ``reset(seed=s)`` determines all later levels. ``reset(options={"level": level})`` plays this
+    level, a ``Level`` or its drawing, for one episode.
 
     Args:
-        obstacle_fraction: obstacles per cell; of several, each level has one at random.
-        path_length: moves on the shortest path; of several, each level has one at random.
+        obstacle_fraction: obstacles per cell, or several fractions, of which each level has a
+            random one.
+        path_length: moves on the shortest path, or several numbers, of which each level has a
+            random one.
         mechanism: as in :func:`~proposer_rl.tasks.mazes.generation.generate_levels`.
-        render_mode: what :meth:`render` gives, a picture or a text.
+        render_mode: ``"rgb_array"`` for pictures or ``"ansi"`` for texts from :meth:`render`.
         **maze: ``height``, ``width``, ``max_steps``, ``step_penalty`` and ``observe_agent`` of
             :class:`~proposer_rl.tasks.mazes.task.MazeSettings`.
 
@@ -56,10 +56,13 @@ class SingleMaze(gymnasium.Env[Any, Any]):
         render_mode: Literal["rgb_array", "ansi"] | None = None,
         **maze: Any,
     ) -> None:
-        if "frameskip" in maze:  # TorchRL's GymEnv tries it, and asks for this very error
+        if "frameskip" in maze:  # TorchRL's GymEnv tries it, and expects this error
             raise TypeError("SingleMaze got an unexpected keyword argument 'frameskip'")
         rules = MazeSettings(**maze)
-        fractions, lengths = _several(obstacle_fraction), _several(path_length)
+        fractions, lengths = (
+            value if isinstance(value, list) else [value]
+            for value in (obstacle_fraction, path_length)
+        )
         if max(lengths) > rules.max_steps:
             raise ArgumentError(
                 f"max_steps={rules.max_steps}: must be at least the path length {max(lengths)}, "
@@ -75,7 +78,7 @@ class SingleMaze(gymnasium.Env[Any, Any]):
             step_penalty=rules.step_penalty,
             observe_agent=rules.observe_agent,
         )
-        self._state: TensorDictBase | None = None  # None where an episode must begin
+        self._state: TensorDictBase | None = None  # None before a reset
         self.observation_space = spaces.Dict(
             agent=spaces.Box(np.zeros(2, np.int64), np.array(grid) - 1, dtype=np.int64),
             planes=spaces.Box(0, 1, (3 + rules.observe_agent, *grid), np.float32),
@@ -84,24 +87,27 @@ class SingleMaze(gymnasium.Env[Any, Any]):
 
     @property
     def level(self) -> Level:
-        """Returns the level that is being played, batch shape []."""
+        """Returns the level of the current episode, batch shape []."""
         return self._env.levels
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begins an episode.
+        """Begins an episode on a new level, or on that of the options.
 
         Raises:
-            ValueError: if the level in the options is none of this grid.
+            ValueError, RuntimeError: if the options' level does not fit the grid.
         """
-        given = self._read(options["level"]) if options else None
+        given = options["level"] if options else None
+        if given is not None:
+            given = given if isinstance(given, Level) else Level.from_text(given)
+            validate_levels(given)
         super().reset(seed=seed)
         if seed is not None:
             self._drawn = []
         if given is None and not self._drawn:
             self._drawn = list(self._draw(int(self.np_random.integers(2**63))).unbind(0))
-        self._env.set_levels(self._drawn.pop(0) if given is None else given)
+        self._env.set_levels(self._drawn.pop(0) if given is None else given.cpu())
         self._state = self._env.reset()
         return self._observe(self._state), {}
 
@@ -111,7 +117,7 @@ class SingleMaze(gymnasium.Env[Any, Any]):
         Raises:
             gymnasium.error.ResetNeeded: if the episode is over.
         """
-        assert self.action_space.contains(action), f"{action!r} invalid"  # as Gymnasium's say it
+        assert self.action_space.contains(action), f"{action!r} invalid"  # as in Gymnasium's own
         if self._state is None:
             raise ResetNeeded("the episode is over: call reset()")
         after = self._env.step(self._state.set("action", torch.tensor(int(action))))["next"]
@@ -120,7 +126,7 @@ class SingleMaze(gymnasium.Env[Any, Any]):
         return self._observe(after), float(after["reward"].double()), *ends, {}
 
     def render(self) -> Any:
-        """Draws the maze: uint8 [H', W', 3] or text, as ``render_mode`` says, else nothing."""
+        """Returns a picture uint8 [H', W', 3] or a text, as ``render_mode`` says; else None."""
         if self.render_mode is None:
             return None
         picture = self._env.render(self.render_mode)
@@ -134,13 +140,3 @@ class SingleMaze(gymnasium.Env[Any, Any]):
 
     def _observe(self, state: TensorDictBase) -> Observation:
         return {key: state[key].numpy().copy() for key in ("agent", "planes")}
-
-    def _read(self, level: Level | str | Sequence[str]) -> Level:
-        """Returns the level in ``options["level"]``."""
-        one = level if isinstance(level, Level) else Level.from_text(level)
-        validate_levels(one)
-        return one.cpu().clone()
-
-
-def _several(value: N | list[N]) -> list[N]:
-    return value if isinstance(value, list) else [value]

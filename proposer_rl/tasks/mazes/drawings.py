@@ -1,4 +1,4 @@
-"""Mazes for readers: pictures, records of what a Solver did, and files (docs/how_to/levels.md)."""
+"""Draws mazes as pictures and records, and reads and writes their files (docs/how_to/levels.md)."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from torch import Tensor
 from proposer_rl.learning import in_first_episode
 from proposer_rl.runs.folder import storage
 from proposer_rl.runs.records import SampleRecord, checked, png
-from proposer_rl.task import named
+from proposer_rl.settings import within
 from proposer_rl.tasks.mazes.levels import FREE, Level, shortest_path_length
 
-SUFFIXES = (".txt", ".json", ".jsonl")  # the last is a run's record of what it trained on
+SUFFIXES = (".txt", ".json", ".jsonl")  # the last is a run's record of its training
 SETS = {file.stem: file for file in sorted(Path(__file__).parent.glob("*.txt"))}
-"""Files of the sets of levels that come with the package, by their names."""
+"""Files of the sets of levels that come with the package, by name."""
 
 _HEADER = re.compile(r"\[(.*)\]")
 _RECORD = re.compile(r"path_length *[:=] *(-?\d{1,9})")
 
-EPISODE = "•"  # a free cell that the Solver's episode went through
+EPISODE = "•"  # a free cell on the path of the Solver's episode
 
-# Okabe and Ito's palette, which stays distinct under the common forms of colour blindness.
+# Okabe and Ito's palette, whose colours are distinct with common forms of colour blindness.
 WALL_COLOUR = (45, 45, 45)
 FREE_COLOUR = (250, 250, 250)
 LINE_COLOUR = (215, 215, 215)
@@ -48,12 +48,12 @@ def draw_level(
     """Draws one level.
 
     Args:
-        level: A level of batch shape ``[]``; if it has a ``direction`` (0 right, 1 down, 2 left,
-            3 up), a white triangle in the start's cell points there.
-        path: Cells (row, column) to connect by a line, ``[T, 2]``; successive cells are equal or
-            share a side.
-        agent: Row and column at which to draw a round agent.
-        cell: Side of a cell in pixels, at least 4.
+        level: A level of batch shape ``[]``. If it has a ``direction`` (0 right, 1 down, 2 left,
+            3 up), a white triangle in the start's cell shows it.
+        path: Cells (row, column) to connect by a line, ``[T, 2]``, each equal to the one before
+            or beside it.
+        agent: Row and column of an agent, drawn as a disc.
+        cell: Side of a cell, at least 4 pixels.
 
     Returns:
         uint8 ``[H * cell + 1, W * cell + 1, 3]`` on the CPU, with lines one pixel wide between
@@ -87,7 +87,7 @@ def draw_level(
 
 
 def level_records(levels: Level, rollout: TensorDictBase | None) -> Iterator[dict[str, Any]]:
-    """Draws levels [n], with the Solver's first episode there [n, T], as records."""
+    """Yields records of levels [n], pictures and texts, with a Solver's first episodes [n, T]."""
     levels = levels.cpu()
     for i, text in enumerate(levels.to_text()):
         path = None if rollout is None else _first_path(rollout[i])
@@ -103,12 +103,12 @@ def level_records(levels: Level, rollout: TensorDictBase | None) -> Iterator[dic
 
 
 def recorded_drawing(text: Sequence[str]) -> list[str]:
-    """Returns the rows of a level from the text of its record, without the Solver's path."""
+    """Returns the rows of a level's drawing from its record, without the Solver's path."""
     return [line.replace(" ", "").replace(EPISODE, FREE) for line in text]
 
 
 def _first_path(steps: TensorDictBase) -> list[list[int]]:
-    """Cells (row, column) that the agent was in, from the start to the end of its episode [T]."""
+    """Returns the agent's cells (row, column) from start to end of its first episode in [T]."""
     first = in_first_episode(steps)
     return steps["agent"][:1].tolist() + steps["next", "agent"][first].tolist()
 
@@ -116,7 +116,7 @@ def _first_path(steps: TensorDictBase) -> list[list[int]]:
 def _paint(
     picture: Tensor, place: Sequence[int], shape: Tensor, colour: tuple[int, int, int]
 ) -> None:
-    """Paints what a bool ``[cell, cell]`` covers of the cell at a row and column."""
+    """Paints the pixels of a bool ``[cell, cell]`` in the cell at a row and column."""
     cell = len(shape)
     top, left = (int(number) * cell for number in place)
     square = picture[top : top + cell, left : left + cell]
@@ -134,7 +134,7 @@ class Item:
 
 @dataclass
 class Items:
-    """What a file in JSON holds."""
+    """The content of a file in JSON."""
 
     levels: list[Item]
 
@@ -142,31 +142,36 @@ class Items:
 def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict[str, Level]:
     """Reads a file of levels.
 
+    A file in JSON is ``{"levels": [{"name": "hall", "level": ["S..", "..G"], "path_length": 3}]}``;
+    the path length may be missing. A run's ``curriculum.jsonl`` has an object in each line:
+    ``updates``, ``seed`` and ``levels``, each with its drawing as ``text``; a last line without its
+    newline was interrupted, and is left out. Its levels are named by updates and place in the
+    batch, such as ``update_00010_1``, or ``seed_0_update_00010_1`` if there are several seeds.
+
     Args:
-        path: A file whose name ends in ``.txt`` or ``.json``, or a run's ``curriculum.jsonl``.
+        path: A file whose name ends in ``.txt`` (see :func:`levels_from_text`), ``.json`` or
+            ``.jsonl``.
         kind: Class of the levels, whose ``from_text`` reads their drawings.
 
     Returns:
         Levels of batch shape ``[]`` by their names, in the file's order.
 
     Raises:
-        ValueError: If the file holds something else; the message names the file and the level.
+        ValueError: If the file has another content; the message names the file and the level.
         StorageError: If it cannot be read.
     """
     path = Path(path)
     with storage(path, "read"):
         content = path.read_bytes()
-
-    def levels() -> dict[str, Level]:
+    try:
         text = content.decode("utf-8-sig")  # some editors begin a file with a mark
         if path.suffix == ".json":
-            return levels_from_json(text, kind)
+            return _levels(checked(Items, text.encode(), "").levels, kind)
         if path.suffix == ".jsonl":
-            return levels_from_record(text, kind)
+            return _levels(_recorded(text), kind)
         return levels_from_text(text, path.stem, kind)
-
-    found: dict[str, Level] = named(str(path), levels)
-    return found
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def levels_from_text(
@@ -176,14 +181,14 @@ def levels_from_text(
 
     Args:
         text: For each level a line ``[name]``, perhaps a line ``path_length: 12``, and the rows of
-            its drawing as :meth:`Level.from_text` reads them. Blank lines, and lines that begin
-            with a semicolon, are ignored.
+            its drawing as in :meth:`Level.from_text`. Blank lines, and lines that begin with a
+            semicolon, are ignored.
         unnamed: Name of a level drawn before the first name.
         kind: As in :func:`read_levels`.
 
     Raises:
-        ValueError: If a line or level is not like that, a name occurs twice, there is no level, or
-            a path length is not that of the level.
+        ValueError: If a drawing is not a level, a name occurs twice, there is no level, or a path
+            length is not that of the level.
     """
     drawn: list[Item] = []
     for line in map(str.strip, text.splitlines()):
@@ -199,39 +204,11 @@ def levels_from_text(
     return _levels(drawn, kind)
 
 
-def levels_from_json(text: str, kind: type[Level] = Level) -> dict[str, Level]:
-    """Reads levels from JSON.
-
-    Args:
-        text: ``{"levels": [{"name": "hall", "level": ["S..", "..G"], "path_length": 3}]}``; the
-            path length may be missing.
-        kind: As in :func:`read_levels`.
-
-    Raises:
-        ValueError: As :func:`levels_from_text`.
-    """
-    return _levels(checked(Items, text.encode(), "").levels, kind)
-
-
-def levels_from_record(text: str, kind: type[Level] = Level) -> dict[str, Level]:
-    """Reads the levels of a run's ``curriculum.jsonl``.
-
-    Args:
-        text: One JSON object per line: ``updates``, ``seed`` and ``levels``, each of which has its
-            drawing as ``text``, with the Solver's episode in it. A last line without its newline
-            was interrupted, and is left out.
-        kind: As in :func:`read_levels`.
-
-    Returns:
-        Levels by updates and place in the batch, as ``update_00010_1``, of several seeds by these,
-        too, as ``seed_0_update_00010_1``.
-
-    Raises:
-        ValueError: If a line is not like that, or there is no level.
-    """
+def _recorded(text: str) -> list[Item]:
+    """Reads the levels of a run's ``curriculum.jsonl``; see :func:`read_levels`."""
     rows = checked(list[SampleRecord], [json.loads(x) for x in text.split("\n")[:-1]], "")
     several = len({row.seed for row in rows}) > 1
-    drawn = [
+    return [
         Item(
             f"seed_{row.seed}_" * several + f"update_{row.updates:05}_{nth}",
             recorded_drawing(level.text),
@@ -239,7 +216,6 @@ def levels_from_record(text: str, kind: type[Level] = Level) -> dict[str, Level]
         for row in rows
         for nth, level in enumerate(row.levels, 1)
     ]
-    return _levels(drawn, kind)
 
 
 def levels_to_text(levels: Mapping[str, Level]) -> str:
@@ -256,7 +232,8 @@ def _levels(drawn: Sequence[Item], kind: type[Level]) -> dict[str, Level]:
         where = f"level {item.name!r:.80}"
         if item.name in levels:
             raise ValueError(f"{where}: the name occurs twice")
-        level = levels[item.name] = named(where, kind.from_text, "\n".join(item.level))
+        with within(where, ValueError):
+            level = levels[item.name] = kind.from_text("\n".join(item.level))
         if item.path_length not in (None, length := int(shortest_path_length(level))):
             raise ValueError(
                 f"{where}: path_length is {item.path_length}, but the shortest path has {length} "

@@ -1,10 +1,9 @@
-"""Evaluates a policy per cell in a maze: exactly, with visits and episodes, or by playing.
+"""Evaluates policies that depend on the cell of a maze, exactly or by playing episodes.
 
-A maze with a policy per cell is a Markov chain over its cells in which the goal absorbs. Both
-evaluators have one signature: ``evaluator(levels [*B], cell_logits [*B, 4, H, W], generator)``
-gives a tensordict of batch shape ``[*B]`` with ``"return"`` and ``"success"``. The exact evaluator
-draws nothing from the generator. What it sums up in one number, :func:`success_from_cells` and
-:func:`expected_visits` have for each cell.
+Both evaluators have the same signature: ``evaluator(levels [*B], cell_logits [*B, 4, H, W],
+generator)`` returns a tensordict of batch shape ``[*B]`` with ``"return"`` and ``"success"``. The
+exact one draws nothing from the generator. :func:`success_from_cells` and :func:`expected_visits`
+have exact results for every cell.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from proposer_rl.tasks.mazes.maze_env import MazeEnv
 
 @dataclass(frozen=True)
 class ExactEvaluator:
-    """Expected return and probability of success, without sampling.
+    """Computes the expected return and the probability of success without sampling.
 
     A maze with a policy per cell is a Markov chain over its cells in which the goal absorbs. With
     p_t(c) the probability of being at cell c before step t + 1 and T the step limit, success is
@@ -100,16 +99,15 @@ class ExactEvaluator:
 
 @dataclass(frozen=True)
 class RolloutEvaluator:
-    """Mean return and share of successes over episodes played in :class:`MazeEnv`.
+    """Plays episodes in :class:`MazeEnv` for mean return and share of successes.
 
-    Levels ``[*B, E]`` share the random numbers of E levels over all indices of ``*B``: replicas of
-    a Solver differ only by what they do, and the result of one does not depend on which others are
-    evaluated with it.
+    For levels ``[*B, E]``, all indices of ``*B`` share the random numbers of E levels: replicas of
+    a Solver differ only by their policies, and the result of one does not depend on the others.
 
     Attributes:
         max_steps: Step limit of an episode.
         step_penalty: Cost of a step.
-        episodes: Episodes played in each maze, at least one; their actions are drawn.
+        episodes: Episodes in each maze, at least one, with sampled actions.
     """
 
     max_steps: int = 25
@@ -133,7 +131,7 @@ class RolloutEvaluator:
         state = env.reset()
         playing = torch.ones(batch, dtype=torch.bool, device=levels.walls.device)
         returns = torch.zeros_like(playing, dtype=torch.float32)
-        for number in uniform:  # one for each step up to the limit: nothing is truncated before
+        for number in uniform:  # one for each step up to the limit
             cell = cell_index(state["agent"], levels.walls.shape[-1])[..., None, None]
             here = cumulative.gather(-2, cell.expand(*batch, 1, len(MOVES))).squeeze(-2)
             threshold = number.expand(batch).unsqueeze(-1) * here[..., -1:]
@@ -146,7 +144,7 @@ class RolloutEvaluator:
 
 @torch.no_grad()
 def policy_path(level: Level, cell_logits: Tensor, max_steps: int = 25) -> Tensor:
-    """Follows the most probable actions from the start.
+    """Returns the paths of the most probable actions from the start.
 
     Args:
         level: Levels ``[*B]``.
@@ -154,8 +152,8 @@ def policy_path(level: Level, cell_logits: Tensor, max_steps: int = 25) -> Tenso
         max_steps: Steps to take.
 
     Returns:
-        int64 ``[*B, max_steps + 1, 2]``: row and column before each step and after the last;
-        the goal is not left again.
+        int64 ``[*B, max_steps + 1, 2]``: row and column before each step and after the last one.
+        A path stays at the goal.
     """
     width = level.walls.shape[-1]
     table = successors(level)  # [*B, 4, H*W]
@@ -170,12 +168,11 @@ def policy_path(level: Level, cell_logits: Tensor, max_steps: int = 25) -> Tenso
 
 
 def optimal_return(levels: Level, max_steps: int = 25, step_penalty: float = 0.01) -> Tensor:
-    """Returns the largest expected return of any policy, that of a shortest path.
+    """Returns the largest expected return of any policy, which follows a shortest path.
 
-    With d moves on it, T the step limit and c the step's penalty it is 1 - c d if d <= T: the step
-    that reaches the goal costs, too, and none of fewer steps does. Otherwise every policy plays to
-    the limit and gets -c T. As d <= T implies 1 - c d > -c T, reaching the goal is optimal at
-    any penalty.
+    With d moves on that path, step limit T and step penalty c it is 1 - c d if d <= T; the step to
+    the goal has its cost, too. Otherwise every policy plays to the limit, for a return of -c T. As
+    d <= T implies 1 - c d > -c T, reaching the goal is optimal at any penalty.
 
     Args:
         levels: Levels ``[*B]``; the goal need not be reachable.
@@ -199,9 +196,9 @@ def optimal_return(levels: Level, max_steps: int = 25, step_penalty: float = 0.0
 def worst_mean(values: Tensor, fraction: float) -> Tensor:
     """Returns the mean of the lowest values, the conditional value at risk of a uniform draw.
 
-    With n values and m = fraction · n it is exactly the mean of the m lowest, of which the last
-    counts in part where m is no whole number (Rockafellar & Uryasev, Journal of Banking & Finance
-    26, 2002).
+    With n values and m = fraction · n it is the mean of the m lowest ones. If m is not a whole
+    number, the last of them counts in part (Rockafellar & Uryasev, Journal of Banking & Finance 26,
+    2002).
 
     Args:
         values: float ``[*B, n]``.
@@ -216,12 +213,12 @@ def worst_mean(values: Tensor, fraction: float) -> Tensor:
     """
     count = fraction * values.shape[-1]
     rank = torch.arange(values.shape[-1], device=values.device, dtype=values.dtype)
-    weight = (count - rank).clamp(0, 1)  # 1 for the whole ones, then the part, then 0
+    weight = (count - rank).clamp(0, 1)  # 1 for whole ones, then the part, then 0
     return (values.sort(-1).values * weight).sum(-1) / count
 
 
 def _policy(cell_logits: Tensor, greedy: bool = False) -> Tensor:
-    """Returns action probabilities ``[*B, 4, H, W]``, as precise as the logits."""
+    """Returns action probabilities ``[*B, 4, H, W]``, in float32 or the logits' wider dtype."""
     precise = torch.promote_types(cell_logits.dtype, torch.float32)
     if greedy:
         best = cell_logits.argmax(-3, keepdim=True)
@@ -230,7 +227,7 @@ def _policy(cell_logits: Tensor, greedy: bool = False) -> Tensor:
 
 
 def _transitions(levels: Level, policy: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-    """Splits a policy into staying and leaving.
+    """Returns the probabilities of staying in a cell and of leaving it.
 
     Args:
         levels: Levels ``[*B]``, N of them.
@@ -238,8 +235,8 @@ def _transitions(levels: Level, policy: Tensor, goal: Tensor) -> tuple[Tensor, T
         goal: int64 ``[N]``, number of the goal.
 
     Returns:
-        The probability of staying at a cell, ``[H, W, N]``, and of leaving it by each action,
-        ``[4, H, W, N]``; those of the goal are 1 and 0.
+        The probability of staying, ``[H, W, N]``, and of leaving by each action, ``[4, H, W, N]``;
+        at the goal 1 and 0.
     """
     free = pad(cells_first(~levels.walls).to(policy), (0, 0, 1, 1, 1, 1))  # [H+2, W+2, N]
     leave = policy.reshape(-1, *policy.shape[-3:]).permute(1, 2, 3, 0)  # [4, H, W, N]
@@ -255,7 +252,7 @@ def _transitions(levels: Level, policy: Tensor, goal: Tensor) -> tuple[Tensor, T
 
 
 def _shifted(padded: Tensor, move: tuple[int, int]) -> Tensor:
-    """Views a grid ``[H+2, W+2, N]`` one move on from each cell: ``[H, W, N]``."""
+    """Returns a view of a grid ``[H+2, W+2, N]``, one move on from each cell: ``[H, W, N]``."""
     (down, right), (height, width) = move, padded.shape[:2]
     return padded[1 + down : height - 1 + down, 1 + right : width - 1 + right]
 
@@ -274,7 +271,7 @@ def success_from_cells(level: Level, policy: Tensor, max_steps: int) -> Tensor:
     """Returns the probability of reaching the goal from every cell within the step limit.
 
     Returns:
-        float ``[H, W]``, 1 at the goal. What it says of an obstacle has no meaning.
+        float ``[H, W]``, 1 at the goal, and without meaning at obstacles.
 
     Example:
         Uniformly random moves in a corridor, two steps:
@@ -293,11 +290,10 @@ def success_from_cells(level: Level, policy: Tensor, max_steps: int) -> Tensor:
 
 
 def expected_visits(level: Level, policy: Tensor, max_steps: int) -> Tensor:
-    """Returns the expected number of steps that an episode takes from every cell.
+    """Returns the expected number of steps from every cell in an episode.
 
     Returns:
-        float ``[H, W]``, 0 at the goal, where no step is taken; their sum is the expected length of
-        an episode.
+        float ``[H, W]``, 0 at the goal; their sum is the expected length of an episode.
 
     Example:
         >>> level = Level.from_text("S.G")

@@ -1,8 +1,9 @@
-"""Batched generation of mazes that meet their specification exactly, and random edits of them."""
+"""Draws mazes that meet their specification exactly, from distributions of them, and edits them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import torch
@@ -11,11 +12,13 @@ from torch import Tensor
 from proposer_rl.models import check_torch_defaults
 from proposer_rl.tasks.mazes.levels import (
     Level,
+    LevelSpec,
     cell_index,
     cell_position,
     cells_at_depth,
     depth_schedule,
     padded_index,
+    shortest_path_length,
 )
 
 Generators = torch.Generator | None | Sequence[torch.Generator]
@@ -34,14 +37,14 @@ def generate_levels(
 
     Every level has ``round(obstacle_fraction * H * W)`` obstacles, a free start, a free goal, and a
     shortest path of ``path_length`` moves. The product is rounded in float64, halves to the even
-    number, from the fraction as it is passed: where a half matters, pass float64.
+    number; pass the fraction in float64 if a half matters.
 
     - ``uniform``: obstacles uniform over the cells, start uniform over the free cells, goal uniform
       over the cells at distance ``path_length`` from it; obstacles and start are drawn again
       until there is such a cell.
-    - ``path_first``: among obstacles only, a random path without shortcuts is carved from a uniform
-      start; then cells are opened in random order, except those that would make the path from
-      start to goal shorter, until the number of obstacles is met; drawn again if it cannot be.
+    - ``path_first``: a random path without shortcuts is carved into solid obstacles from a uniform
+      start. Then cells are opened in random order, except those that would shorten the path from
+      start to goal, until the number of obstacles is met. The level is drawn again if that fails.
 
     Args:
         obstacle_fraction: Fractions in [0, 1), broadcast with ``path_length`` to ``[*B]``.
@@ -49,20 +52,18 @@ def generate_levels(
         height: H, cells.
         width: W, cells.
         mechanism: ``"uniform"`` or ``"path_first"``.
-        generator: Source of randomness; None for the default one. The levels are drawn on its
-            device, so that they depend on it alone. With a sequence of generators, one for each
-            index of the first dimension, levels ``[k]`` are those that generator k alone would
-            give, drawn together.
-        device: Where the levels are returned; None for that of ``obstacle_fraction`` or
-            ``path_length`` if either is a tensor, else that of the generator, else the CPU.
+        generator: Source of randomness; None for torch's default one. Levels are drawn on its
+            device, so that they depend on nothing else. Of a sequence of generators, one for each
+            index of the first dimension, generator k draws levels ``[k]``, the same as alone.
+        device: Of the returned levels; None for that of ``obstacle_fraction`` or ``path_length``
+            if either is a tensor, else that of the generator, else the CPU.
 
     Returns:
         Levels of batch shape ``[*B]``.
 
     Raises:
-        ValueError: If an argument is invalid, or if a specification is impossible or so rare that
-            the mechanism did not meet it within a bounded number of candidates; the message names
-            the specification.
+        ValueError: If an argument is invalid; or, naming the specification, if one is impossible or
+            so rare that the mechanism did not meet it within a bounded number of candidates.
 
     Example:
         >>> levels = generate_levels(0.25, [3, 5], height=6, width=6)
@@ -101,7 +102,7 @@ def generate_levels(
 def _specifications(
     obstacle_fraction: float | Sequence[float] | Tensor, path_length: int | Sequence[int] | Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Returns both arguments in range, as float64 and int64 tensors of one shape on the CPU."""
+    """Returns both arguments as float64 and int64 tensors of one shape on the CPU."""
     if isinstance(obstacle_fraction, Tensor):
         obstacle_fraction = obstacle_fraction.detach().cpu()
     fraction = torch.as_tensor(obstacle_fraction, dtype=torch.float64)
@@ -117,10 +118,10 @@ def _specifications(
 
 
 class _Task:
-    """The problems of one call, pooled by distinct specification and group.
+    """Draws the levels of one call, pooled by distinct specification and group.
 
-    Specifications are in ascending order of path length, as the mechanisms require. All counts are
-    kept on the CPU; only candidates live on the device.
+    Specifications are in ascending order of path length, as the mechanisms need them. Counts are on
+    the CPU, and only candidates on the device.
     """
 
     def __init__(
@@ -150,7 +151,7 @@ class _Task:
         self._check_necessary()
 
     def solve(self, generator: Generators, device: torch.device) -> Level:
-        """Draws candidates until every problem has its level; ``[N]`` on ``device``."""
+        """Draws candidates until every problem has its level: ``[N]`` on the device."""
         count, (height, width) = self.order.shape[0], self.grid
         cells = torch.zeros(2, count, 2, dtype=torch.int64, device=device)
         walls = torch.zeros(count, height, width, dtype=torch.bool, device=device)
@@ -178,22 +179,22 @@ class _Task:
         return result
 
     def _share(self, pending: Tensor, drawn: Tensor, accepted: Tensor, on_cpu: bool) -> Tensor:
-        """Returns how many candidates of each specification should fill what is pending.
+        """Returns how many candidates of each specification to draw for the pending levels.
 
-        The estimated rate is that of a uniform prior (one success and one failure seen in
-        advance), so a specification never met asks for twice as many each time.
+        The rate of success is estimated with a uniform prior (one success and one failure seen in
+        advance), so a specification that was never met asks for twice as many each time.
         """
         rate = (accepted + 1) / (drawn + 2)
         share = (1.1 * pending / rate).ceil().long() + 2 * (pending > 0)
         chunk = self.mechanism.chunk if on_cpu else self.mechanism.device_chunk
         ordered, group = share[self.by_group], self.group[self.by_group]
         before = ordered.cumsum(0) - ordered
-        before -= before[torch.searchsorted(group, group)]  # only those of the same group
+        before -= before[torch.searchsorted(group, group)]  # only in the same group
         room = torch.empty_like(share).scatter_(0, self.by_group, chunk - before)
         return share.minimum(room.clamp(min=0))
 
     def _check_necessary(self) -> None:
-        """Refuses at once what no level can meet."""
+        """Refuses impossible specifications at once."""
         height, width = self.grid
         free, farthest = height * width - self.obstacles, height + width - 2
         for spec in (free <= self.length).nonzero().flatten():
@@ -205,7 +206,7 @@ class _Task:
             self._refuse(spec, f"without obstacles no two cells are over {farthest} moves apart")
 
     def _check_rarity(self, filled: Tensor, drawn: Tensor, accepted: Tensor) -> None:
-        """Gives up on what is met less often than once in ``limit`` candidates."""
+        """Gives up on specifications that fewer than one in ``limit`` candidates meet."""
         hopeless = (filled < self.wanted) & (drawn > self.mechanism.limit * (accepted + 1))
         for spec in hopeless.nonzero().flatten():
             self._refuse(
@@ -223,20 +224,20 @@ class _Task:
         )
 
 
-_NEVER = 2**31 - 1  # rank of a cell that is not to be opened
+_NEVER = 2**31 - 1  # rank of a cell that stays closed
 _CLOSED = 100  # added to a cell's count of carved neighbours: it can no longer be carved
 
 
 class Draws:
-    """Random matrices with one column for each candidate.
+    """Draws random matrices with one column for each candidate.
 
     Each column comes from the generator of the candidate's group, in the order of the group's
-    candidates. So a group draws the same numbers whatever the other groups are.
+    candidates, so that a group's numbers do not depend on other groups.
 
     Args:
         generators: One generator (None for torch's default one), or one for each group.
-        group: int64 ``[C]`` on the CPU, the candidates' groups; without effect with one generator.
-        device: Where to draw, that of the generators.
+        group: int64 ``[C]`` on the CPU, the candidates' groups; unused with one generator.
+        device: Of the generators.
     """
 
     def __init__(self, generators: Generators, group: Tensor, device: torch.device) -> None:
@@ -255,7 +256,7 @@ class Draws:
         )
 
     def of(self, kept: Tensor) -> Draws:
-        """Returns the draws of some candidates, given by their ascending indices, int64 ``[A]``."""
+        """Returns draws for some of the candidates, by their ascending indices, int64 ``[A]``."""
         return Draws(self._generators, self._group[kept.cpu()], self.device)
 
     def _columns(self, draw: Callable[[int, torch.Generator | None], Tensor]) -> Tensor:
@@ -273,7 +274,7 @@ def draw_uniform(
     """Draws one candidate per entry and keeps those in which the path length occurs.
 
     A candidate is a uniform pair of obstacles and start. It is kept if some cell lies at exactly
-    the distance that is asked for, and the goal is then uniform over such cells.
+    the path length from the start; the goal is uniform over such cells.
 
     Args:
         obstacles: int64 ``[C]`` on the CPU, number of obstacles of each candidate.
@@ -290,7 +291,7 @@ def draw_uniform(
     goals = cells_at_depth(free, start, path_length).flatten(0, 1)  # [H*W, C]
     kept = goals.any(0).nonzero().squeeze(1)  # [A]
     marked = goals.index_select(1, kept).cumsum(0, dtype=torch.int32)  # up to and with each cell
-    # Equal parts of [0, 1) lead to each goal; rounding may make the product their whole number.
+    # Equal parts of [0, 1) lead to each goal; rounding may make the product equal to their count.
     rank = (draws.of(kept).rand(1).squeeze(0) * marked[-1]).int().minimum(marked[-1] - 1)
     goal = (marked <= rank).sum(0)
     return kept, Level(
@@ -304,9 +305,9 @@ def draw_uniform(
 def _draw_walls_and_start(obstacles: Tensor, cells: int, draws: Draws) -> tuple[Tensor, Tensor]:
     """Draws uniform obstacles and a uniform free start.
 
-    The obstacles are drawn by selection sampling (Knuth, The Art of Computer Programming, vol. 2,
+    Obstacles are drawn by selection sampling (Knuth, The Art of Computer Programming, vol. 2,
     3.4.2, algorithm S): a cell becomes one with probability (obstacles still needed) / (cells still
-    left), which gives exactly the number asked for. They are drawn among all cells but the last;
+    left), which results in their exact number. They are drawn among all cells but the last;
     swapping that free cell with a uniform start cell makes the pair uniform.
 
     Returns:
@@ -315,7 +316,7 @@ def _draw_walls_and_start(obstacles: Tensor, cells: int, draws: Draws) -> tuple[
     device, count = draws.device, obstacles.shape[0]
     needed = obstacles.to(device, torch.float32)
     draw = draws.rand(cells - 1)
-    # Strictly below the number of cells left, also after rounding: the last ones needed are taken.
+    # Strictly below the number of cells left, also after rounding, so that none is missing.
     draw *= torch.arange(cells - 1, 0, -1, device=device).unsqueeze(1)
     walls = torch.zeros(cells, count, dtype=torch.bool, device=device)
     for wall, threshold in zip(walls, draw, strict=False):
@@ -332,7 +333,7 @@ def draw_path_first(
 ) -> tuple[Tensor, Level]:
     """Draws one candidate per entry and keeps those that meet their specification.
 
-    Args and returns are those of :func:`draw_uniform`. A candidate is lost if its path runs into
+    Arguments and results are as in :func:`draw_uniform`. A candidate is lost if its path runs into
     a dead end, or if too few cells can be opened without a shortcut.
     """
     path, carved = _carve(path_length.to(draws.device), height, width, draws)  # [D+1, C], [C]
@@ -402,9 +403,9 @@ def _open_cells(
 ) -> tuple[Tensor, Tensor]:
     """Opens cells in the order of their rank, skipping those that would make a shortcut.
 
-    One cell at a time is not needed: the first cell that would make a shortcut is the one with the
-    least rank that *some* shortcut cannot avoid, and all cells before it can be opened. So
-    each round skips one cell in every maze in which such a cell comes before the last cell needed.
+    Cells need not be opened one by one: the first cell that would make a shortcut has the least
+    rank that *some* shortcut cannot avoid, and all cells before it can be opened. So each round
+    skips one cell in every maze in which such a cell comes before the last cell needed.
 
     Args:
         rank: int32 ``[H, W, N]``; changed in place.
@@ -435,13 +436,14 @@ def _open_cells(
 
 
 def _shortcut_rank(rank: Tensor, start: Tensor, goal: Tensor, path_length: Tensor) -> Tensor:
-    """Finds the first cell whose opening, after all those of lower rank, makes a shortcut.
+    """Finds the first cell that makes a shortcut when it is opened after all of lower rank.
 
-    It is the least, over all walks shorter than the path, of the greatest rank on the walk.
+    Its rank is the least, over all walks shorter than the path, of the greatest rank on the walk.
     Lengths of walks between two cells of a grid differ by even numbers and a walk may go to and
     fro, so walks of exactly ``path_length - 2`` moves cover all of them.
 
-    Takes what :func:`_open_cells` does; gives the cell's rank, int32 ``[N]``, or ``_NEVER``.
+    Arguments are as in :func:`_open_cells`; the result is the cell's rank, int32 ``[N]``, or
+    ``_NEVER``.
     """
     height, width, count = rank.shape
     reached = rank.new_full((height + 2, width + 2, count), _NEVER)
@@ -465,7 +467,7 @@ class _Mechanism(NamedTuple):
     limit: int  # candidates per level after which a specification counts as impossible
     chunk: int  # candidates drawn at once on a CPU, so that the working set stays in its cache
     device_chunk: int  # the same on an accelerator, where few large launches are faster
-    pools: bool  # whether a candidate's random numbers are as many whatever the others are
+    pools: bool  # whether the count of a candidate's random numbers is independent of others
 
 
 _MECHANISMS = {
@@ -489,23 +491,21 @@ def edit_levels(levels: L, count: int, generators: Sequence[torch.Generator]) ->
     - the goal moves to a uniform free cell other than start and goal;
     - the start does.
 
-    Where there is no such cell, the level stays as it is. Nothing else is asked of an edit: the
-    goal may become unreachable.
+    If there is no such cell, the level stays as it is. The goal may become unreachable.
 
-    It is the mutation of ACCEL (Parker-Holder et al. 2022, arXiv 2203.01302), with two deviations
-    from how libraries draw it, among nothing, a flip and a move of the goal: no edit is wasted, and
-    the start moves, too.
+    This is the mutation of ACCEL (Parker-Holder et al. 2022, arXiv 2203.01302). Libraries draw
+    among no change, a flip and a move of the goal; here no edit is wasted, and the start moves,
+    too.
 
     Args:
-        levels: valid levels ``[K, n]`` on any device; they are left as they are.
-        count: edits of each level, at least 0. With the same generators the first ``count`` edits
-            of more are those of fewer.
-        generators: K generators of the CPU, one for each index of the first dimension: levels
-            ``[k]`` depend on generator k alone.
+        levels: valid levels ``[K, n]`` on any device, which are not changed.
+        count: edits of each level, at least 0. With the same generators, more edits begin with
+            those of fewer.
+        generators: K generators on the CPU, of which generator k alone determines levels ``[k]``.
 
     Returns:
-        Valid levels ``[K, n]`` of the levels' class on their device; what else a level has, such as
-        the direction of a :class:`~proposer_rl.tasks.view_mazes.view_levels.ViewLevel`, stays.
+        Valid levels ``[K, n]`` of the same class and device. Other entries stay, such as the
+        direction of a :class:`~proposer_rl.tasks.view_mazes.view_levels.ViewLevel`.
 
     Example:
         >>> levels = Level.from_text(["S..G"] * 4).reshape(1, 4)
@@ -525,7 +525,7 @@ def edit_levels(levels: L, count: int, generators: Sequence[torch.Generator]) ->
 
 
 def _edit(levels: L, operator: Tensor, place: Tensor) -> L:
-    """Edits levels [C] once each; int64 [C] says how, float [C] in [0, 1) where."""
+    """Edits levels [C] once each, by operators int64 [C] at places float [C] in [0, 1)."""
     width = levels.walls.shape[-1]
     walls = levels.walls.flatten(1)  # [C, H*W]
     start, goal = (cell_index(end, width).unsqueeze(1) for end in (levels.start, levels.goal))
@@ -533,7 +533,7 @@ def _edit(levels: L, operator: Tensor, place: Tensor) -> L:
     allowed = allowed.scatter(1, start, False).scatter(1, goal, False)
     marked = allowed.cumsum(1, dtype=torch.int32)  # up to and with each cell
     choices = marked[:, -1]
-    # Equal parts of [0, 1) lead to each cell; rounding may make the product their whole number.
+    # Equal parts of [0, 1) lead to each cell; rounding may make the product equal to their count.
     rank = (place * choices).int().minimum(choices - 1)
     cell = (marked <= rank.unsqueeze(1)).sum(1)  # [C]
 
@@ -548,3 +548,152 @@ def _edit(levels: L, operator: Tensor, place: Tensor) -> L:
         goal=position.where(applies(MOVE_GOAL).unsqueeze(1), levels.goal),
     )
     return edited
+
+
+class LevelDistribution:
+    """A distribution of levels over equally likely specifications.
+
+    The constructor draws a level of each specification, by a generator of its own, to check that it
+    can be met.
+
+    Args:
+        specifications: Pairs (obstacle fraction, path length), at least one; see
+            :class:`~proposer_rl.tasks.mazes.levels.LevelSpec`.
+        mechanism: ``"uniform"`` or ``"path_first"``; see
+            :func:`generate_levels`.
+        height: H, cells.
+        width: W, cells.
+        device: Of the levels.
+
+    Raises:
+        ValueError: If a specification cannot be met.
+    """
+
+    def __init__(
+        self,
+        specifications: Sequence[tuple[float, int]],
+        mechanism: str = "uniform",
+        height: int = 10,
+        width: int = 10,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.device = torch.device(device)
+        self.specifications = tuple(LevelSpec(*pair) for pair in specifications)
+        self.mechanism = mechanism
+        self.height = height
+        self.width = width
+        self.generate(torch.arange(self.size), torch.Generator().manual_seed(0))
+
+    @property
+    def size(self) -> int:
+        """Returns the number of specifications."""
+        return len(self.specifications)
+
+    def decode(self, index: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns obstacle fractions, float64, and path lengths, int64, by index ``[*B]``."""
+        fractions, lengths = zip(*self.specifications, strict=True)
+        return (
+            torch.tensor(fractions, dtype=torch.float64, device=index.device)[index],
+            torch.tensor(lengths, device=index.device)[index],
+        )
+
+    def generate(self, index: Tensor, generator: Generators = None) -> Level:
+        """Draws levels ``[*B]`` of the specifications with an index, int64 ``[*B]``.
+
+        Generators are as in :func:`generate_levels`.
+        """
+        fraction, length = self.decode(index.cpu())
+        grid = (self.height, self.width)
+        return generate_levels(fraction, length, *grid, self.mechanism, generator, self.device)
+
+    def sample(
+        self, batch_shape: int | Sequence[int] = (), generator: torch.Generator | None = None
+    ) -> Level:
+        """Draws levels ``[*B]``, or ``[B]`` for a number, of random specifications."""
+        shape = (batch_shape,) if isinstance(batch_shape, int) else tuple(batch_shape)
+        place = "cpu" if generator is None else generator.device
+        index = torch.randint(self.size, shape, generator=generator, device=place)
+        return self.generate(index, generator)
+
+    def __str__(self) -> str:
+        pairs = "; ".join(
+            f"{fraction:g} obstacles, path of {length}"
+            for fraction, length in self.specifications[:4]
+        )
+        return f"{pairs}; {self.mechanism}"
+
+
+class SpecificationSpace(LevelDistribution):
+    """All pairs of M obstacle fractions and N path lengths, as bins for a Proposer.
+
+    Bin ``i * N + j`` is ``(obstacle_fractions[i], path_lengths[j])``.
+
+    Args:
+        obstacle_fractions: M fractions in [0, 1).
+        path_lengths: N numbers of moves.
+        mechanism, height, width, device: As in :class:`LevelDistribution`.
+
+    Attributes:
+        axes: The M fractions and N lengths, by name.
+
+    Raises:
+        ValueError: If a specification cannot be met.
+
+    Example:
+        >>> space = SpecificationSpace((0.0, 0.2), (2, 4, 6), height=6, width=6)
+        >>> space.size
+        6
+        >>> space.specifications[4]
+        LevelSpec(obstacle_fraction=0.2, path_length=4)
+    """
+
+    def __init__(
+        self,
+        obstacle_fractions: Sequence[float] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5),
+        path_lengths: Sequence[int] = (2, 4, 6, 8, 10, 12, 14, 16),
+        mechanism: str = "uniform",
+        height: int = 10,
+        width: int = 10,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.axes: dict[str, Sequence[float]] = {
+            "obstacle fraction": tuple(obstacle_fractions),
+            "path length": tuple(path_lengths),
+        }
+        pairs = list(product(obstacle_fractions, path_lengths))
+        super().__init__(pairs, mechanism, height, width, device)
+
+    @property
+    def coordinates(self) -> Tensor:
+        """Returns each pair's fraction and length, scaled to [-1, 1]: float [M * N, 2].
+
+        The coordinate on an axis with a single value is 0.
+        """
+        return torch.cartesian_prod(*self._scaled(*self.axes.values()))
+
+    def locate(self, levels: Level) -> Tensor:
+        """Returns the :attr:`coordinates` of levels [*B]: float32 [*B, 2] on the CPU.
+
+        The path length to a goal that cannot be reached counts as the number of cells.
+        """
+        length = shortest_path_length(levels)
+        moves = length.where(length >= 0, self.height * self.width)
+        return torch.stack(self._scaled(levels.walls.float().mean((-2, -1)).cpu(), moves.cpu()), -1)
+
+    def nearest(self, specifications: Sequence[LevelSpec]) -> Tensor:
+        """Returns the bin nearest to each of n specifications, also to those outside: int64 [n].
+
+        Rounding decides between bins that are equally near.
+        """
+        scaled = self._scaled(*zip(*specifications, strict=True))
+        return torch.cdist(torch.stack(scaled, -1), self.coordinates).argmin(-1)
+
+    def _scaled(self, *lines: Sequence[float] | Tensor) -> list[Tensor]:
+        """Returns values scaled to -1 to 1 along each axis, or 0 if it has a single value."""
+        scaled = []
+        for values, axis in zip(lines, self.axes.values(), strict=True):
+            known = torch.tensor(axis, dtype=torch.float32)
+            middle, reach = (known.max() + known.min()) / 2, (known.max() - known.min()) / 2
+            place = torch.as_tensor(values, dtype=torch.float32)
+            scaled.append((place - middle) / reach if reach > 0 else torch.zeros_like(place))
+        return scaled

@@ -1,4 +1,4 @@
-"""The common base of tasks on mazes, whatever an agent can do and see there."""
+"""The base of tasks on mazes: drawing, editing, reading and measuring levels."""
 
 from __future__ import annotations
 
@@ -15,38 +15,48 @@ from torch import Tensor
 
 from proposer_rl.learning import SolverSettings, first_episode_success
 from proposer_rl.models import ActorCritic, MapEncoder
-from proposer_rl.task import Board, ComputeContext, LevelResult, Task, check_distributions, named
-from proposer_rl.tasks.mazes.drawings import SETS, SUFFIXES, level_records, read_levels
+from proposer_rl.settings import within
+from proposer_rl.task import Board, ComputeContext, LevelResult, Task, check_distributions
+from proposer_rl.tasks.mazes.drawings import (
+    SETS,
+    SUFFIXES,
+    level_records,
+    levels_from_text,
+    levels_to_text,
+    read_levels,
+    recorded_drawing,
+)
 from proposer_rl.tasks.mazes.generation import edit_levels
 from proposer_rl.tasks.mazes.levels import Level, shortest_path_length
 
-STEPS_PER_SHORTEST = 2  # of a named level: steps allowed for each one of its shortest way
+STEPS_PER_SHORTEST = 2  # allowed on a named level for each step of its shortest way
 _ON_A_GRID = re.compile(r"(.+?)(?:@(\d{1,3})x(\d{1,3}))?")
 
 
 class GridTask(Task):
-    """Mazes that are drawn, edited, read from files, and measured level by level.
+    """A task on mazes, whatever an agent can do and see there.
 
     Args:
         maze: the inner environment's settings: ``height``, ``width``, ``max_steps`` and others.
         distributions: settings by name.
-        target: the name of the one that the Solver is to master.
+        target: the name of the distribution that the Solver is to master.
         space: settings of the Proposer's bins.
-        encoder_channels: of the convolutions with which a Proposer reads a probe.
+        encoder_channels: of the convolutions by which a Proposer reads a probe.
         evaluation: settings: ``distributions``, ``levels``, ``seed`` and ``episodes``.
         solver: the Solver's training.
         context: device, precision and cores.
 
     Attributes:
         level: class of the levels.
-        fewest_steps: of a shortest way to the goal of levels [*B]: int64 [*B], -1 for none.
-        probe_planes: of a probe.
-        steps_name: what the steps of a shortest way are called in results.
-        counting: what of an episode's steps a reader must know.
-        board: what ``bin/play`` draws on.
+        fewest_steps: function of levels [*B] to the steps of a shortest way to the goal, int64
+            [*B], -1 for none.
+        probe_planes: count of a probe's planes.
+        steps_name: name of the shortest way's steps in results.
+        counting: a remark for readers on how steps are counted.
+        board: for drawing and playing levels in ``bin/play``.
 
     Raises:
-        ValueError: naming the key, if settings that are each valid do not go together.
+        ValueError: naming the key, if settings contradict each other.
     """
 
     noun = "mazes"
@@ -73,18 +83,20 @@ class GridTask(Task):
         check_distributions(distributions, target, evaluation.distributions)
         self.maze = maze
         self.grid = (maze.height, maze.width)
-        self.device = torch.device(context.device)  # of what is made next
+        self.device = torch.device(context.device)  # the distributions need it
         self._kinds, self._target = dict(distributions), target
         self._encoder_channels = encoder_channels
+        with within("space", ValueError):
+            bins = self.make_space(space)
         rules = asdict(maze)
         rules.pop("observe_agent", None)
         super().__init__(
             distributions={
-                name: named(f"distributions.{name}", self.make_distribution, kind, *self.grid)
+                name: self._made(f"distributions.{name}", kind, *self.grid)
                 for name, kind in distributions.items()
             },
             target=target,
-            space=named("space", self.make_space, space),
+            space=bins,
             solver=solver,
             context=context,
             measured_on=evaluation.distributions,
@@ -106,17 +118,17 @@ class GridTask(Task):
         self.default_levels = "shapes"
 
     def probe_encoder(self, features: int) -> MapEncoder:
-        """Returns a convolutional network that reads probes."""
+        """Returns a convolutional network for probes."""
         return MapEncoder(self.probe_planes, self._encoder_channels, features)
 
     def training_metrics(self, levels: Level, rollout: TensorDictBase) -> TensorDict:
-        """Returns what Solvers trained on and how they fared there, each [K] from [K, P].
+        """Returns statistics of training levels [K, P] and episodes on them, each [K].
 
         - ``obstacle_fraction``: obstacles per cell;
         - ``path_length``, ``path_length_sd``: mean and standard deviation of the moves on the
-          shortest path, over the levels that have a path; both 0 where none has;
-        - ``solvable``: share of the levels whose goal can be reached within the step limit;
-        - ``train_success``: share of the levels whose goal the first episode reached.
+          shortest path, over the levels that have a path; both 0 if none has one;
+        - ``solvable``: share of levels whose goal can be reached within the step limit;
+        - ``train_success``: share of levels whose goal was reached in the first episode.
         """
         length, steps = shortest_path_length(levels), self.fewest_steps(levels)
         mean, deviation = _moments(length.float(), length >= 0)
@@ -136,7 +148,7 @@ class GridTask(Task):
 
     @property
     def about(self) -> dict[str, str]:
-        """Returns texts about the task by their labels."""
+        """Returns facts about the task for readers, by their labels."""
         height, width = self.grid
         kinds = "; ".join(
             f"{name.upper()} ({self.distributions[name]})" for name in self.evaluated_on
@@ -149,7 +161,7 @@ class GridTask(Task):
 
     @abstractmethod
     def make_distribution(self, settings: Any, height: int, width: int) -> Any:
-        """Returns the levels of a distribution's settings on a grid."""
+        """Returns the distribution of these settings on a grid."""
 
     @abstractmethod
     def make_space(self, settings: Any) -> Any:
@@ -163,31 +175,42 @@ class GridTask(Task):
         about: Mapping[str, Mapping[str, int]],
         max_steps: int,
     ) -> Iterator[LevelResult]:
-        """Yields what K Solvers reach on levels [n] of one size, described by their names."""
+        """Yields the results of K Solvers on levels [n] of one size.
+
+        Args:
+            agent: K Solvers.
+            levels: [n].
+            about: facts about each level, by its name.
+            max_steps: step limit of an episode.
+        """
 
     @abstractmethod
     def at_once(self, cells: int) -> int:
-        """Returns how many levels of so many cells are evaluated together."""
+        """Returns how many levels to evaluate together, for levels of so many cells."""
 
     def check_level(self, name: str, level: Level) -> None:
-        """Refuses a level that these Solvers cannot see.
+        """Checks that Solvers can see a level.
 
         Raises:
-            ValueError: naming the level.
+            ValueError: naming the level, if they cannot.
         """
 
+    def _made(self, key: str, settings: Any, height: int, width: int) -> Any:
+        with within(key, ValueError):
+            return self.make_distribution(settings, height, width)
+
     def step_limit(self, steps: int, slack: int = STEPS_PER_SHORTEST) -> int:
-        """Returns the step limit of a level, given the steps of its shortest way."""
+        """Returns the step limit of a level with so many steps on its shortest way."""
         return max(self.maze.max_steps, slack * steps)
 
     def level_results(
         self, agent: ActorCritic, name: str, max_steps: int | None
     ) -> list[LevelResult]:
-        """Returns what Solvers reach on levels of a distribution, of a file or of a shipped set.
+        """Returns the results of Solvers on levels of a distribution, a file or an included set.
 
-        Without a step limit a distribution has that of the task, so that the means are those of its
-        metrics, also on another grid (``id@13x13``); other levels at least twice the steps of a
-        shortest way.
+        Without a step limit, levels of a distribution have the task's, also on another grid
+        (``id@13x13``), so that means equal the run's metrics. Other levels have at least twice the
+        steps of a shortest way.
         """
         levels, slack = self._named_levels(name)
         for known, level in levels.items():
@@ -199,14 +222,14 @@ class GridTask(Task):
     def results_of(
         self, agent: ActorCritic, levels: Mapping[str, Any], limit_of: Callable[[int], int]
     ) -> list[LevelResult]:
-        """Returns what K Solvers reach on levels of any size, in the levels' order.
+        """Returns the results of K Solvers on levels of any size, in the levels' order.
 
-        Those of one size and one step limit are evaluated together.
+        Levels of one size and step limit are evaluated together.
 
         Args:
             agent: K Solvers.
-            levels: of batch shape [], by their names.
-            limit_of: the step limit of a level, given the steps of its shortest way.
+            levels: of batch shape [], by name.
+            limit_of: function of the steps of a level's shortest way to its step limit.
         """
         about: dict[str, dict[str, int]] = {}
         batches: dict[tuple[int, ...], list[str]] = {}
@@ -227,10 +250,10 @@ class GridTask(Task):
         return sorted(results, key=lambda result: (place[result.level], result.solver))
 
     def _named_levels(self, name: str) -> tuple[dict[str, Any], int]:
-        """Returns the levels that a user names, and the steps allowed per step of a shortest way.
+        """Returns levels for ``--levels``, and the steps allowed for each of a shortest way.
 
         Raises:
-            ValueError: if there are no such levels.
+            ValueError: if there are no levels of this name.
             StorageError: if a file cannot be read.
         """
         if name in SETS or Path(name).suffix in SUFFIXES:
@@ -242,21 +265,61 @@ class GridTask(Task):
             levels: Any
             if asked[2] is None:
                 levels = self.evaluation_levels(known)
-            else:  # the same levels and names however it was spelt
+            else:  # the same levels and names for any case of the letters
                 size = [int(cells) for cells in asked.group(2, 3)]
                 known = f"{known}@{size[0]}x{size[1]}"
-                grid = named(f"--levels {known}", self.make_distribution, kind, *size)
+                grid = self._made(f"--levels {known}", kind, *size)
                 levels = grid.sample(self._levels, self.stream("levels", known))
             return {f"{known}_{i:03}": levels[i].cpu() for i in range(len(levels))}, 0
         raise ValueError(
             f"--levels {name}: must be one of: {', '.join(SETS)}, a file that ends in "
             f"{' or '.join(SUFFIXES)}, or a distribution: {', '.join(self._kinds)}, as it is "
-            f"or on another grid as in {self._target}@13x13"
+            f"or on another grid, as in {self._target}@13x13"
         )
 
 
+class Drawings:
+    """Reads and draws mazes; the base of a :class:`~proposer_rl.task.Board`.
+
+    Args:
+        task: the task of the levels.
+    """
+
+    sets = tuple(SETS)
+
+    def __init__(self, task: GridTask) -> None:
+        self._task = task
+        self.size = task.grid
+
+    def read(self, rows: Sequence[str]) -> Any:
+        """Returns the level of a drawing; see :class:`~proposer_rl.task.Board`."""
+        level = self._task.level.from_text("\n".join(rows))
+        self._task.check_level("drawn", level)
+        return level
+
+    def draw(self, level: Level) -> list[str]:
+        """Returns the rows of a level's drawing."""
+        return str(level.to_text()).splitlines()
+
+    def drawing(self, record: Mapping[str, Any]) -> list[str]:
+        """Returns the rows of a record's level, without the Solver's path."""
+        return recorded_drawing(record["text"])
+
+    def level_set(self, name: str) -> Mapping[str, Level]:
+        """Returns the levels of an included set; agents with a direction look to the right."""
+        return read_levels(SETS[name], self._task.level)
+
+    def read_file(self, text: str) -> Mapping[str, Level]:
+        """Returns the levels of a file's text; see docs/how_to/levels.md for the format."""
+        return levels_from_text(text, kind=self._task.level)
+
+    def write_file(self, name: str, level: Level) -> str:
+        """Returns a file's text with a level; see docs/how_to/levels.md for the format."""
+        return levels_to_text({name: level})
+
+
 def _moments(values: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns mean and deviation of some of the values [*B, P], 0 of none: float [*B] each."""
+    """Returns mean and deviation of chosen values among [*B, P], 0 for none: float [*B] each."""
     count = which.sum(-1).clamp_min(1)
     mean = (values * which).sum(-1) / count
     square = (values - mean.unsqueeze(-1)).square()

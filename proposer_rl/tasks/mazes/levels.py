@@ -1,8 +1,8 @@
-"""Mazes: specification, cells, text and plane forms, and shortest paths.
+"""Represents mazes as cells, texts and planes, and finds their shortest paths.
 
-A batch is searched by spreading a frontier over all of its mazes at once. For that, grids are laid
-out *cells first*, ``[H, W, N]``: one shift of the grid is then a view whose rows are N contiguous
-entries, so each step costs a few vectorised passes.
+A search spreads a frontier over all mazes of a batch at once. Grids are laid out *cells first*,
+``[H, W, N]``: a shifted grid is then a view whose rows are N contiguous entries, and each step
+takes a few vectorised passes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class LevelSpec(NamedTuple):
 
     Attributes:
         obstacle_fraction: Obstacles per cell, in [0, 1); a grid of H x W cells has exactly
-            ``round(obstacle_fraction * H * W)`` of them.
+            ``round(obstacle_fraction * H * W)`` obstacles.
         path_length: Moves on the shortest path from start to goal, at least 1.
     """
 
@@ -48,7 +48,7 @@ class Level(TensorClass):
 
     @classmethod
     def from_text(cls, text: str | Sequence[str]) -> Self:
-        """Reads levels drawn with one character per cell.
+        """Reads levels that are drawn with one character per cell.
 
         Args:
             text: One drawing (lines of ``#`` wall, ``.`` free, ``S`` start, ``G`` goal; blank
@@ -58,8 +58,9 @@ class Level(TensorClass):
             A level of batch shape ``[]``, or ``[n]`` for a sequence of n drawings.
 
         Raises:
-            ValueError: If a drawing is not a rectangle, holds another character, or does not
-                have exactly one start and one goal; or if the drawings differ in size.
+            ValueError: If a drawing is not a rectangle, has another character, or does not have
+                exactly one start and one goal.
+            RuntimeError: If the drawings differ in size.
 
         Example:
             >>> level = Level.from_text('''
@@ -80,7 +81,7 @@ class Level(TensorClass):
     @classmethod
     def _parse(cls, drawing: str) -> Any:
         """Reads the level of one drawing."""
-        rows = drawn_rows(drawing)
+        rows = [row for row in map(str.strip, drawing.splitlines()) if row]
         flat = "".join(rows)
         ends = sorted(flat.replace(WALL, "").replace(FREE, ""))
         if len({*map(len, rows)}) != 1 or ends != sorted([START, GOAL]):
@@ -128,7 +129,7 @@ def cell_plane(cell: Tensor, grid: Sequence[int]) -> Tensor:
 
 
 def cell_index(cell: Tensor, width: int) -> Tensor:
-    """Numbers cells row by row: int64 ``[*B, 2]`` (row, column) to int64 ``[*B]``."""
+    """Returns numbers of cells, counted row by row, int64 ``[*B]``, from rows and columns."""
     return cell[..., 0] * width + cell[..., 1]
 
 
@@ -144,9 +145,9 @@ def validate_levels(level: Level) -> None:
         level: Levels of any batch shape.
 
     Raises:
-        ValueError: If a shape or dtype is wrong, or if a start or goal lies outside the grid or on
-            an obstacle, or if they coincide, or if a direction is none; the message says which and
-            how many.
+        ValueError: If a shape or dtype is wrong, a start or goal lies outside of the grid or on an
+            obstacle, both are the same cell, or a direction is not one; the message says which
+            fault it is and how many levels have it.
     """
     walls, direction = level.walls, getattr(level, "direction", None)
     height, width = walls.shape[-2:]
@@ -176,25 +177,20 @@ def _refuse_any(bad: Tensor, fault: str) -> None:
         raise ValueError(f"{count} of {bad.numel()} levels have the {fault}")
 
 
-def drawn_rows(drawing: str) -> list[str]:
-    """Returns the rows of a drawing, without blank lines and what stands before or after a row."""
-    return [row for row in map(str.strip, drawing.splitlines()) if row]
-
-
 MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
-"""Change of row and column by action 0 up, 1 down, 2 left, 3 right."""
+"""Change of row and column by the actions 0 up, 1 down, 2 left, 3 right."""
 
 
 def successors(level: Level) -> Tensor:
-    """Tabulates where each action leads from each cell.
+    """Tabulates the cell after each action in each cell.
 
-    A move into an obstacle or out of the grid leads to the cell itself.
+    After a move into an obstacle or out of the grid it is the same cell.
 
     Args:
         level: Levels of batch shape ``[*B]``.
 
     Returns:
-        int64 ``[*B, 4, H*W]``, numbers of cells (row * W + column) by action and cell.
+        int64 ``[*B, 4, H*W]``, numbers of cells (row * W + column), by action and cell.
     """
     walls = level.walls
     height, width = walls.shape[-2:]
@@ -214,15 +210,14 @@ def successors(level: Level) -> Tensor:
 def shortest_way(
     following: Sequence[Sequence[int]], start: int, arrived: Callable[[int], bool]
 ) -> list[int] | None:
-    """Returns the nodes of a path of fewest actions, the first and the last included.
+    """Returns the nodes of a path of fewest actions, with both ends.
+
+    Of several it is the one whose actions come first. None if there is no path.
 
     Args:
-        following: where each action leads from each node.
+        following: the node after each action in each node.
         start: the first node.
-        arrived: whether a node is a last one.
-
-    Returns:
-        Of several the one whose actions come first; None where there is none.
+        arrived: function of a node to whether the path may end there.
     """
     before, waiting = {start: start}, deque([start])
     while waiting:
@@ -239,11 +234,11 @@ def shortest_way(
     return None
 
 
-STEPS_BETWEEN_CHECKS = 8  # asking whether the frontier is empty waits for the device
+STEPS_BETWEEN_CHECKS = 8  # each check for an empty frontier waits for the device
 
 
 def shortest_path_length(level: Level) -> Tensor:
-    """Moves on the shortest path from start to goal.
+    """Returns the number of moves on the shortest path from start to goal.
 
     Args:
         level: Levels of batch shape ``[*B]``.
@@ -275,21 +270,21 @@ def shortest_path_length(level: Level) -> Tensor:
 
 
 def cells_first(grid: Tensor) -> Tensor:
-    """Lays ``[*B, H, W]`` out as a contiguous ``[H, W, N]``, N the number of mazes."""
+    """Returns ``[*B, H, W]`` as a contiguous ``[H, W, N]`` of N mazes."""
     return grid.reshape(-1, *grid.shape[-2:]).permute(1, 2, 0).contiguous()
 
 
 def depth_schedule(depth: Tensor) -> list[tuple[int, int]]:
-    """Plans a spread in which every maze stops at a depth of its own.
+    """Plans a search in which every maze stops at its own depth.
 
-    Mazes are in ascending order of depth, so that those still spreading are a slice.
+    Mazes are in ascending order of depth, so that those that still take part are a slice.
 
     Args:
         depth: int64 ``[N]``, ascending, on the CPU.
 
     Returns:
-        For step s = 1, 2, ..., max(depth), a pair (first, end): mazes ``first:`` take part in the
-        step, and for ``first:end`` it is the last one.
+        For each step s = 1, 2, ..., max(depth) a pair (first, end): mazes ``first:`` take part in
+        it, and for mazes ``first:end`` it is the last step.
     """
     steps = torch.arange(1, int(depth[-1]) + 2)
     bounds = torch.searchsorted(depth, steps).tolist()
@@ -318,12 +313,12 @@ def cells_at_depth(free: Tensor, source: Tensor, depth: Tensor) -> Tensor:
 
 
 def padded_index(cell: Tensor, width: int) -> Tensor:
-    """Returns numbers of cells in a grid padded on every side, from those in the grid itself."""
+    """Returns numbers of cells in the grid with a rim on every side, from numbers without it."""
     return (cell // width + 1) * (width + 2) + cell % width + 1
 
 
 def _begin(free: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the frontier at step 0, ``[H + 2, W + 2, N]`` with an empty rim, and other cells."""
+    """Returns the first frontier, ``[H + 2, W + 2, N]`` with an empty rim, and unvisited cells."""
     height, width, count = free.shape
     frontier = free.new_zeros(height + 2, width + 2, count)
     frontier.flatten(0, 1).scatter_(0, padded_index(source, width).unsqueeze(0), True)
@@ -331,7 +326,7 @@ def _begin(free: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _spread(frontier: Tensor, spare: Tensor, unvisited: Tensor) -> None:
-    """Writes the next frontier into ``spare`` and takes it out of ``unvisited``."""
+    """Writes the next frontier into ``spare``, and removes it from ``unvisited``."""
     following = spare[1:-1, 1:-1]
     torch.bitwise_or(frontier[:-2, 1:-1], frontier[2:, 1:-1], out=following)
     following |= frontier[1:-1, :-2]

@@ -1,4 +1,4 @@
-"""The maze as a TorchRL environment, and the base of environments that play levels."""
+"""Steps batches of mazes as TorchRL environments."""
 
 from __future__ import annotations
 
@@ -29,33 +29,33 @@ END_KEYS = ("done", "terminated", "truncated")
 
 
 class LevelEnv(EnvBase):
-    """A batch of levels, one agent in each; what an agent can do there is a subclass's.
+    """The base of environments of levels with one agent in each; subclasses define its actions.
 
     A state is the tensordict that is stepped: its entry ``"agent"``, int64 ``[*B, 2]``, is the
-    agent's row and column, ``"step_count"``, int64 ``[*B, 1]``, the steps taken in this episode.
-    An episode begins at the start of the *same* level, also when TorchRL resets finished ones by
-    itself. Levels change only by :meth:`set_levels`. Nothing is drawn at random.
+    agent's row and column, and ``"step_count"``, int64 ``[*B, 1]``, the steps taken in this
+    episode. Every episode begins at the start of the *same* level, also when TorchRL resets
+    finished ones by itself; only :meth:`set_levels` changes levels. Nothing is drawn at random.
 
     Args:
-        levels: Levels of any batch shape ``[*B]``, which with their device become the
-            environment's. They must be valid; see
-            :func:`~proposer_rl.tasks.mazes.levels.validate_levels` for hand-designed ones.
+        levels: Levels of any batch shape ``[*B]``; the environment takes over their shape and
+            device. They must be valid; check hand-designed ones by
+            :func:`~proposer_rl.tasks.mazes.levels.validate_levels`.
         max_steps: Step limit of an episode.
 
     Attributes:
-        success_rule: What of a step is a success, as ``success`` of
+        success_rule: The entry of a step that tells success, for ``success`` of
             :class:`~proposer_rl.teaching.LevelTransform`.
     """
 
     success_rule = "terminated"
-    _constant: Sequence[str] = ()  # observations that stay the same throughout an episode
+    _constant: Sequence[str] = ()  # observations that do not change during an episode
 
     def __init__(self, levels: Level, max_steps: int) -> None:
         check_torch_defaults()
         super().__init__(
             device=levels.walls.device,
             batch_size=levels.batch_size,
-            # A start is never a goal. Else TorchRL checks every reset, and waits for the device.
+            # A start is never a goal. Otherwise TorchRL checks every reset, waiting for the device.
             allow_done_after_reset=True,
         )
         self.max_steps = max_steps
@@ -67,40 +67,30 @@ class LevelEnv(EnvBase):
 
     @abstractmethod
     def _tabulate(self, levels: Level) -> None:
-        """Tabulates what a step needs of levels that are taken up."""
+        """Prepares the tables for steps in new levels."""
 
     @abstractmethod
     def _first(self) -> dict[str, Tensor]:
-        """Returns what is observed when an episode begins, ``"agent"`` too; do not write to it."""
+        """Returns the first observations of episodes, with ``"agent"``; do not write to them."""
 
     @property
     def levels(self) -> Level:
-        """Returns the levels that are being played, ``[*B]``."""
+        """Returns the levels of the current episodes, ``[*B]``."""
         return self._levels
 
     def set_levels(self, levels: Level) -> None:
-        """Replaces the levels; each maze plays its new one from its own next reset on.
+        """Replaces the levels, each from the next reset of its maze on.
 
         Args:
-            levels: Levels of the environment's batch shape, grid and device.
-
-        Raises:
-            ValueError: If they differ in batch shape, grid or device.
+            levels: Levels of the environment's batch shape and grid.
         """
-        given = (levels.batch_size, levels.walls.shape[-2:], levels.walls.device)
-        own = (self.batch_size, self._grid, self._levels.walls.device)
-        if given != own:
-            raise ValueError(
-                "levels must keep the environment's batch shape, grid and device "
-                f"{_describe(*own)}, got {_describe(*given)}"
-            )
         self._next_levels.update_(levels)
         self._waiting = True
 
     def step_and_maybe_reset(
         self, tensordict: TensorDictBase
     ) -> tuple[TensorDictBase, TensorDictBase]:
-        """Steps as TorchRL does, without checks of what this environment has written itself."""
+        """Steps as TorchRL does, without its checks of entries that this environment writes."""
         after, given = self._step(tensordict), tensordict.get("next", None)
         if given is not None:  # by the policy, such as what it remembers
             after.update(given.exclude(*after.keys()))
@@ -110,8 +100,8 @@ class LevelEnv(EnvBase):
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Sends the agents of finished mazes back to their starts.
 
-        It does what TorchRL's method does, without asking a GPU first whether there are any, which
-        would have to be waited for.
+        It does the same as TorchRL's method without waiting for a GPU's answer whether there are
+        any.
         """
         if self._waiting:
             return super().maybe_reset(tensordict)
@@ -129,7 +119,7 @@ class LevelEnv(EnvBase):
         return TensorDict(after, tensordict.batch_size, device=tensordict.device)
 
     def _begun(self, first: Tensor, standing: Tensor, done: Tensor, ended: Tensor | None) -> Tensor:
-        """Returns an entry's values, those of the beginning where mazes are done."""
+        """Returns an entry's values, with first ones where episodes are over."""
         each = first.shape[self.batch_dims :]
         if ended is None:
             return first.where(done.reshape(*self.batch_size, *[1] * len(each)), standing)
@@ -145,7 +135,7 @@ class LevelEnv(EnvBase):
         return self
 
     def _specify(self, actions: int, **observed: TensorSpec) -> None:
-        """Makes the specifications of ``actions`` choices and of further observations."""
+        """Sets the specs, for a number of actions and further observations."""
         batch, (height, width) = self.batch_size, self._grid
         last_cell = torch.tensor([height - 1, width - 1]).expand(*batch, 2)
         self.observation_spec = Composite(
@@ -168,7 +158,7 @@ class LevelEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = None if mask is None else mask.reshape(self.batch_size)
         if mask is None:
-            # A graph of a reset takes up what is there when it is replayed.
+            # A recorded graph of a reset takes the levels that are there when it is replayed.
             if self._waiting or not population.at_hand(self._next_levels.walls):
                 self._play(self._next_levels.clone())
             self._waiting = False
@@ -179,15 +169,14 @@ class LevelEnv(EnvBase):
         none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         ends = {key: none.clone() for key in END_KEYS}
         first = {k: x if k in self._constant else x.clone() for k, x in self._first().items()}
-        # Of these TorchRL takes over only the entries of the mazes that are reset.
+        # TorchRL takes these entries only for the mazes that are reset.
         state = {**first, "step_count": none.long(), **ends}
         return TensorDict(state, self.batch_size, device=self.device)
 
     def _after(self, terminated: Tensor, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """Returns the count of steps, and whether the episode has ended, after a step.
 
-        A step that reaches the goal at the limit is terminated and not truncated, since nothing was
-        cut off.
+        A step that reaches the goal at the limit is terminated and not truncated.
         """
         step_count = tensordict.get("step_count") + 1
         late = step_count >= self.max_steps
@@ -199,11 +188,7 @@ class LevelEnv(EnvBase):
         }
 
     def _set_seed(self, seed: int | None) -> None:
-        """Does nothing: the environment draws nothing at random."""
-
-
-def _describe(batch: torch.Size, grid: torch.Size, device: torch.device) -> str:
-    return f"{list(batch)}, {grid[0]}x{grid[1]}, {device}"
+        """Does nothing, as nothing is drawn at random."""
 
 
 @signed
@@ -218,11 +203,11 @@ class MazeEnv(LevelEnv):
     - Reward: float32 ``[*B, 1]``, 1 on entering the goal, minus ``step_penalty`` at every step, the
       last one included.
     - End: ``terminated`` on reaching the goal; ``truncated`` when the step limit is reached
-      elsewhere. A step that reaches the goal at the limit is terminated and not truncated, since
-      nothing was cut off. ``done`` is either.
+      elsewhere. A step that reaches the goal at the limit is terminated and not truncated.
+      ``done`` is either.
 
     Args:
-        levels: As of :class:`~proposer_rl.tasks.mazes.maze_env.LevelEnv`.
+        levels: As in :class:`~proposer_rl.tasks.mazes.maze_env.LevelEnv`.
         max_steps: Step limit of an episode.
         step_penalty: Cost of a step.
         observe_agent: Whether the planes show the agent.
@@ -260,12 +245,12 @@ class MazeEnv(LevelEnv):
             cell: Side of a cell in pixels.
 
         Returns:
-            uint8 ``[*B, H', W', 3]``; or text (a list of texts for a batch) in which ``A`` is the
+            uint8 ``[*B, H', W', 3]``; or a text, for a batch a list of texts, in which ``A`` is the
             agent.
         """
         levels, agents = self._levels.reshape(-1), self._agent.reshape(-1, 2)
         if mode == "ansi":
-            places = cell_index(agents, self._grid[1] + 1).tolist()  # a line ends by a character
+            places = cell_index(agents, self._grid[1] + 1).tolist()  # with the newlines
             texts = zip(levels.to_text(), places, strict=True)
             marked = [f"{text[:place]}A{text[place + 1 :]}" for text, place in texts]
             return marked if self.batch_dims else marked[0]

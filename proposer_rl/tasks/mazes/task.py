@@ -1,9 +1,9 @@
-"""Mazes as a task: Solvers that see the whole maze, with everything that is known of it exactly."""
+"""Trains and measures Solvers in mazes that they see as a whole, with exact evaluation."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Ge, Interval, Len
@@ -12,26 +12,48 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning import SolverSettings
-from proposer_rl.models import ActorCritic, Population, UNet, cell_logits, map_actor_critic
+from proposer_rl.models import (
+    ActorCritic,
+    Population,
+    UNet,
+    cell_logits,
+    cell_maps,
+    map_actor_critic,
+)
 from proposer_rl.settings import settings
-from proposer_rl.task import ComputeContext, LevelResult, for_copies
-from proposer_rl.tasks.mazes.board import MazeBoard
-from proposer_rl.tasks.mazes.distributions import LevelDistribution, SpecificationSpace
+from proposer_rl.task import CellKind, ComputeContext, LevelResult, for_copies
 from proposer_rl.tasks.mazes.drawings import EPISODE
 from proposer_rl.tasks.mazes.evaluation import (
     ExactEvaluator,
     RolloutEvaluator,
+    expected_visits,
     optimal_return,
+    policy_path,
+    success_from_cells,
     worst_mean,
 )
-from proposer_rl.tasks.mazes.grid_task import GridTask
-from proposer_rl.tasks.mazes.levels import Level, planes, shortest_path_length
+from proposer_rl.tasks.mazes.generation import LevelDistribution, SpecificationSpace
+from proposer_rl.tasks.mazes.grid_task import Drawings, GridTask
+from proposer_rl.tasks.mazes.levels import (
+    FREE,
+    GOAL,
+    START,
+    WALL,
+    Level,
+    cell_index,
+    cell_plane,
+    planes,
+    shortest_path_length,
+    shortest_way,
+    successors,
+)
 from proposer_rl.tasks.mazes.maze_env import MazeEnv
 
 ACTIONS = 4
 PLANES = 3
+DIGITS = 4  # of the numbers on a board: what can be seen
 WORST = 0.1  # of the levels, in <name>_success_worst10
-CELLS_AT_ONCE = 2**17  # that go through the network together
+CELLS_AT_ONCE = 2**17  # in one pass through the network
 
 Mechanism = Literal["uniform", "path_first"]
 Fraction = Annotated[float, Interval(ge=0, lt=1)]
@@ -43,13 +65,14 @@ Channels = Annotated[list[Annotated[int, Ge(1)]], Len(1)]
 
 @settings
 class MazeSettings:
-    """The inner environment.
+    """Settings of the maze.
 
     Attributes:
-        height, width: the grid, in cells.
-        max_steps: steps after which an episode is truncated.
-        step_penalty: what every step costs.
-        observe_agent: draw the agent on a fourth plane; then every step needs its own forward pass.
+        height, width: of the grid, in cells.
+        max_steps: step limit of an episode.
+        step_penalty: cost of a step.
+        observe_agent: whether a fourth plane shows the agent. Every step then needs a forward pass
+            of its own.
     """
 
     height: Annotated[int, Interval(ge=1, le=1000)] = 10
@@ -61,7 +84,7 @@ class MazeSettings:
 
 @settings
 class DistributionSettings:
-    """Levels drawn uniformly from (obstacle fraction, path length) pairs, by one mechanism."""
+    """Settings of a distribution: pairs of obstacle fraction and path length, drawn uniformly."""
 
     specifications: Annotated[list[tuple[Fraction, PathLength]], Len(1)]
     mechanism: Mechanism = "uniform"
@@ -69,7 +92,7 @@ class DistributionSettings:
 
 @settings
 class SpaceSettings:
-    """The Proposer's bins: every obstacle fraction with every path length."""
+    """Settings of the Proposer's bins: every obstacle fraction with every path length."""
 
     obstacle_fractions: Annotated[list[Fraction], Len(1)]
     path_lengths: Annotated[list[PathLength], Len(1)]
@@ -78,11 +101,11 @@ class SpaceSettings:
 
 @settings
 class UNetSettings:
-    """The Solver's U-Net.
+    """Settings of the Solver's U-Net.
 
     Attributes:
         channels: of each resolution, finest first.
-        groups: of every GroupNorm; divides each of the channels.
+        groups: of every GroupNorm, of which each number of channels is a multiple.
         policy_gain, value_gain: gains of the heads' orthogonal initialisation.
     """
 
@@ -94,14 +117,14 @@ class UNetSettings:
 
 @settings
 class MazeEvaluationSettings:
-    """Settings of how the Solver is measured, apart from its training.
+    """Settings of evaluations.
 
     Attributes:
-        distributions: names of the distributions that are measured on.
-        levels: number of levels of each distribution, the same in every run.
-        seed: from which they are drawn.
-        evaluator: of the Proposer's validation levels: exact, or Monte-Carlo episodes.
-        episodes: Monte-Carlo episodes per level.
+        distributions: names of the distributions to measure on.
+        levels: of each distribution, the same in every run.
+        seed: of the levels.
+        evaluator: of the Proposer's validation levels: ``exact``, or ``rollout`` for episodes.
+        episodes: on each level, with ``rollout``.
     """
 
     distributions: Annotated[list[str], Len(1)]
@@ -112,21 +135,21 @@ class MazeEvaluationSettings:
 
 
 class MazeTask(GridTask):
-    """Mazes, and a U-Net that learns to solve them.
+    """Mazes, which a U-Net learns to solve.
 
     Args:
         network: of the Solver.
-        maze, distributions, target, space, encoder_channels, evaluation, solver, context: as of
+        maze, distributions, target, space, encoder_channels, evaluation, solver, context: as in
             :class:`~proposer_rl.tasks.mazes.grid_task.GridTask`.
         make_network: makes the network of a Solver, from planes [*B, 3, H, W] (4 with
             ``observe_agent``) to logits [*B, 4, H, W] and values [*B, 1, H, W]; None for the U-Net
             of the settings.
 
     Raises:
-        ValueError: naming the key, if settings that are each valid do not go together.
+        ValueError: naming the key, if settings contradict each other.
     """
 
-    exact_metrics = True  # whatever the evaluator of the Proposer's reward is
+    exact_metrics = True  # with either evaluator of validation levels
     fewest_steps = staticmethod(shortest_path_length)
     probe_planes = PLANES + ACTIONS
     steps_name = "path_length"
@@ -166,7 +189,7 @@ class MazeTask(GridTask):
             if longest > maze.max_steps:
                 raise ValueError(
                     f"maze.max_steps={maze.max_steps} must be at least {longest}, the path length "
-                    f"of distributions.{name}, which is measured on: nobody could reach the goal"
+                    f"of distributions.{name}, or no episode can reach the goal there"
                 )
         self._rules = (maze.max_steps, maze.step_penalty)
         self._sampled = ExactEvaluator(*self._rules)
@@ -180,7 +203,7 @@ class MazeTask(GridTask):
     def make_distribution(
         self, settings: DistributionSettings, height: int, width: int
     ) -> LevelDistribution:
-        """Returns the levels of a distribution's settings on a grid."""
+        """Returns the distribution of these settings on a grid."""
         kind = (settings.specifications, settings.mechanism)
         return LevelDistribution(*kind, height, width, self.device)
 
@@ -191,13 +214,13 @@ class MazeTask(GridTask):
 
     @property
     def target_shares(self) -> Tensor:
-        """Returns the target's share in each bin, its specifications rounded to bins: float [N]."""
+        """Returns the share of the target's specifications nearest to each bin: float [N]."""
         nearest = self.space.nearest(self.target.specifications)
         return nearest.bincount(minlength=self.space.size) / len(nearest)
 
     @property
     def metrics(self) -> list[str]:
-        """Returns the names of what :meth:`measure` gives."""
+        """Returns the names of the results of :meth:`measure`."""
         kinds = ("success", "return", "success_worst10", "greedy_success", "greedy_return")
         return [f"{name}_{kind}" for name in self.evaluated_on for kind in kinds]
 
@@ -224,7 +247,7 @@ class MazeTask(GridTask):
     def performance(
         self, agent: ActorCritic, levels: Level, generator: torch.Generator
     ) -> TensorDictBase:
-        """Evaluates K Solvers on levels [E] or [K, E], exactly or by episodes, as it is set."""
+        """Evaluates K Solvers on levels [E] or [K, E], by the evaluator of the settings."""
         return self._evaluator(*_with_logits(agent, levels), generator)
 
     def differentiable_performance(self, agent: ActorCritic, levels: Level) -> TensorDictBase:
@@ -261,7 +284,7 @@ class MazeTask(GridTask):
         return TensorDict(means, [agent.copies])
 
     def _exactly(self, levels: Level, logits: Tensor, max_steps: int) -> dict[str, Tensor]:
-        """Evaluates the sampled policy, and as ``greedy_...`` the greedy one, each [K, n]."""
+        """Evaluates the sampled policy, and the greedy one as ``greedy_...``, each [K, n]."""
         penalty = self.maze.step_penalty
         sampled = ExactEvaluator(max_steps, penalty)(levels, logits)
         greedy = ExactEvaluator(max_steps, penalty, greedy=True)(levels, logits)
@@ -275,12 +298,12 @@ class MazeTask(GridTask):
         }
 
     def check_level(self, name: str, level: Level) -> None:
-        """Refuses a level that the U-Net cannot see; of other networks it is not known."""
+        """Checks that the U-Net can see a level; other networks are not checked."""
         if self._make_network is None:
             check_grid(f"level {name!r}", level.walls.shape, self._network)
 
     def at_once(self, cells: int) -> int:
-        """Returns how many levels of so many cells are evaluated together."""
+        """Returns how many levels to evaluate together, for levels of so many cells."""
         return CELLS_AT_ONCE // cells
 
     @torch.no_grad()
@@ -291,10 +314,10 @@ class MazeTask(GridTask):
         about: Mapping[str, Mapping[str, int]],
         max_steps: int,
     ) -> Iterator[LevelResult]:
-        """Yields exactly what K Solvers reach on levels [n] of any one size.
+        """Yields the exact results of K Solvers on levels [n] of one size.
 
-        ``success`` and ``return`` of the sampled policy, and of the greedy one, which takes the
-        most probable actions, ``greedy_success`` (1 or 0) and ``greedy_return``.
+        They are ``success`` and ``return`` of the sampled policy, and ``greedy_success`` (1 or 0)
+        and ``greedy_return`` of the most probable actions.
         """
         copies, logits = _with_logits(agent, levels)
         performance = self._exactly(copies, logits, max_steps)
@@ -304,6 +327,92 @@ class MazeTask(GridTask):
                 yield LevelResult(name, k, known, results)
 
 
+class MazeBoard(Drawings):
+    """Shows Solvers in mazes that they see as a whole; a :class:`~proposer_rl.task.Board`."""
+
+    kinds = (
+        CellKind(FREE, "free"),
+        CellKind(WALL, "wall"),
+        CellKind(START, "start", once=True),
+        CellKind(GOAL, "goal", once=True),
+    )
+    actions = ("up", "down", "left", "right")
+
+    @torch.no_grad()
+    def examine(
+        self, agent: ActorCritic, solver: int, level: Level, max_steps: int | None
+    ) -> dict[str, Any]:
+        """Returns the exact behaviour of a Solver on a level; see :class:`~proposer_rl.task.Board`.
+
+        ``results`` are ``success``, ``return`` and the expected ``steps`` of the sampled policy.
+        ``maps`` are the critic's values, the probability of success from every cell with the whole
+        step limit, and the expected number of steps from there in an episode.
+        """
+        shortest = shortest_path(level)
+        steps, step_penalty = len(shortest or [0]) - 1, self._task.maze.step_penalty
+        limit = max_steps or self._task.step_limit(steps)
+        level = level.to(self._task.device)
+        copies = planes(level.expand(agent.copies, 1))
+        logits, values = (each[solver, 0] for each in cell_maps(agent, copies))
+        logits, values = logits.float(), values[0].float()
+        policy = logits.softmax(0)
+        visits = expected_visits(level, policy, limit)
+        results = ExactEvaluator(limit, step_penalty)(level, logits)
+        goal = cell_plane(level.goal, level.walls.shape).bool()
+        maps = {
+            "critic's value": (values, level.walls | goal),
+            "success from here": (success_from_cells(level, policy, limit), level.walls),
+            "expected visits": (visits, level.walls),
+        }
+        path = policy_path(level, logits, limit).tolist()
+        return {
+            "results": {
+                "success": float(results["success"]),
+                "return": float(results["return"]),
+                "steps": float(visits.sum()),
+            },
+            "policy": _numbers(policy, level.walls | goal),
+            "maps": {name: _numbers(*values) for name, values in maps.items()},
+            "paths": {"solver": _until_it_ends(path, level.goal.tolist()), "shortest": shortest},
+            "next": successors(level).tolist(),
+            "goal": level.goal.tolist(),
+            "max_steps": limit,
+            "step_penalty": step_penalty,
+            "missed": -step_penalty * limit,
+        }
+
+
+def shortest_path(level: Level) -> list[list[int]] | None:
+    """Returns the cells (row, column) of a level's shortest path, from start to goal.
+
+    Of several it is the one whose moves come first in
+    :data:`~proposer_rl.tasks.mazes.levels.MOVES`. None if there is no path.
+    """
+    width = level.walls.shape[1]
+    start, goal = (int(cell_index(cell, width)) for cell in (level.start, level.goal))
+    path = shortest_way(successors(level).tolist(), start, lambda cell: cell == goal)
+    return None if path is None else [list(divmod(cell, width)) for cell in path]
+
+
+def _until_it_ends(path: list[list[int]], goal: list[int]) -> list[list[int]]:
+    """Returns a path up to the goal, or up to the first cell that it enters again."""
+    seen: set[tuple[int, ...]] = set()
+    for length, cell in enumerate(path, 1):
+        if cell == goal or tuple(cell) in seen:
+            return path[:length]
+        seen.add(tuple(cell))
+    return path
+
+
+def _numbers(values: Tensor, without: Tensor) -> list[list[Any]]:
+    """Returns values ``[*A, H, W]`` as lists [H][W][*A], with None in cells of ``without``."""
+    rows = values.movedim((-2, -1), (0, 1)).double().round(decimals=DIGITS).tolist()
+    return [
+        [None if left_out else value for value, left_out in zip(row, line, strict=True)]
+        for row, line in zip(rows, without.tolist(), strict=True)
+    ]
+
+
 def _with_logits(agent: ActorCritic, levels: Level) -> tuple[Level, Tensor]:
     """Returns levels [E] or [K, E] as [K, E], and the K Solvers' logits at every cell."""
     copies = for_copies(agent, levels)
@@ -311,7 +420,7 @@ def _with_logits(agent: ActorCritic, levels: Level) -> tuple[Level, Tensor]:
 
 
 def unet(network: UNetSettings, planes: int) -> UNet:
-    """Returns the U-Net of one Solver, which sees so many planes."""
+    """Returns the U-Net of one Solver for so many planes."""
     return UNet(
         in_channels=planes,
         head_channels=(ACTIONS, 1),
@@ -322,22 +431,25 @@ def unet(network: UNetSettings, planes: int) -> UNet:
 
 
 def faster_precision(channels: Sequence[int], device: torch.device) -> str:
-    """Returns ``"bf16"`` where it was measured to be faster and to learn alike, else ``"fp32"``.
+    """Returns ``"bf16"`` if it was measured to be faster and to learn as well, else ``"fp32"``.
 
-    That is a wide network on a CPU with instructions for it; see docs/explanation/performance.md.
+    It was for wide networks on CPUs with instructions for it; see docs/explanation/performance.md.
 
     Args:
         channels: of the Solver's network.
-        device: that it runs on.
+        device: of the network.
     """
     in_hardware = device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
     return "bf16" if in_hardware and channels[0] >= 64 else "fp32"
 
 
 def check_grid(what: str, size: Sequence[int], network: UNetSettings) -> None:
-    """Refuses a grid that the U-Net of the settings halves to nothing, or to single numbers.
+    """Checks that the U-Net does not halve a grid to nothing, or to single numbers.
 
-    Of those GroupNorm makes zeros.
+    GroupNorm would make zeros of those.
+
+    Raises:
+        ValueError: if it does.
     """
     height, width = size
     if any(
@@ -347,5 +459,5 @@ def check_grid(what: str, size: Sequence[int], network: UNetSettings) -> None:
         raise ValueError(
             f"{what}: {height}x{width} cells are too few for this Solver: with "
             f"network.channels={network.channels} and network.groups={network.groups} a group of "
-            "channels is left with one number or none"
+            "channels has one number or none left"
         )

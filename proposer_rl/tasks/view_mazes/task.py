@@ -1,4 +1,4 @@
-"""The partially observable maze as a task: Solvers with memory, measured by episodes."""
+"""Trains Solvers with memory in partially observable mazes, and measures them by episodes."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from proposer_rl.models import ActorCritic, MemoryNetwork
 from proposer_rl.settings import settings
 from proposer_rl.streams import Streams
 from proposer_rl.task import CellKind, ComputeContext, LevelResult, for_copies
-from proposer_rl.tasks.mazes.board import Drawings
-from proposer_rl.tasks.mazes.grid_task import GridTask
+from proposer_rl.tasks.mazes.grid_task import Drawings, GridTask
 from proposer_rl.tasks.mazes.levels import (
     FREE,
     GOAL,
@@ -42,19 +41,19 @@ from proposer_rl.tasks.view_mazes.view_levels import (
     ViewSpaceSettings,
 )
 
-LOCATING = 4096  # levels by which the target is located among the bins
-EPISODES_AT_ONCE = 4096  # that are played together on named levels
-SHOWN = 20  # sampled episodes that can be watched
+LOCATING = 4096  # levels of the target that are counted in bins
+EPISODES_AT_ONCE = 4096  # on named levels
+SHOWN = 20  # sampled episodes on a board
 Node = list[int]  # row, column and direction
 
 
 @settings
 class ViewMazeSettings:
-    """The inner environment.
+    """Settings of the maze.
 
     Attributes:
-        height, width: the grid inside of its border, in cells.
-        max_steps: steps after which an episode is truncated.
+        height, width: of the grid inside of its border, in cells.
+        max_steps: step limit of an episode.
     """
 
     height: Annotated[int, Ge(3), Le(100)] = 13
@@ -64,14 +63,14 @@ class ViewMazeSettings:
 
 @settings
 class ViewEvaluationSettings:
-    """Settings of how the Solver is measured, apart from its training; always by playing.
+    """Settings of evaluations, which play episodes.
 
     Attributes:
-        distributions: names of the distributions that are measured on.
-        levels: number of levels of each distribution, the same in every run.
-        seed: from which they and the actions' random numbers are drawn.
+        distributions: names of the distributions to measure on.
+        levels: of each distribution, the same in every run.
+        seed: of the levels and of the actions.
         episodes: on each level.
-        named_episodes: on each level of a named set (``bin/eval``).
+        named_episodes: on each level of a set in ``bin/eval``.
     """
 
     distributions: Annotated[list[str], Len(1)]
@@ -82,22 +81,22 @@ class ViewEvaluationSettings:
 
 
 class ViewMazeTask(GridTask):
-    """The partially observable maze, and Solvers with memory.
+    """Partially observable mazes, which Solvers with memory learn to solve.
 
-    A policy with memory has no exact evaluation: everything that is measured is played.
+    A policy with memory has no exact evaluation; all measurements play episodes.
 
     Args:
         network: of the Solver.
-        maze, distributions, target, space, encoder_channels, evaluation, solver, context: as of
+        maze, distributions, target, space, encoder_channels, evaluation, solver, context: as in
             :class:`~proposer_rl.tasks.mazes.grid_task.GridTask`.
 
     Raises:
-        ValueError: naming the key, if settings that are each valid do not go together.
+        ValueError: naming the key, if settings contradict each other.
     """
 
     level = ViewLevel
     fewest_steps = staticmethod(view_env.fewest_actions)
-    probe_planes = 4  # walls, start, goal, and where the Solver goes
+    probe_planes = 4  # walls, start, goal, and the Solver's visits
     steps_name = "fewest_actions"
     replayed = ("rollouts",)
     drop_finished = True
@@ -130,7 +129,7 @@ class ViewMazeTask(GridTask):
     def make_distribution(
         self, settings: ViewDistributionSettings, height: int, width: int
     ) -> ViewDistribution:
-        """Returns the levels of a distribution's settings on a grid."""
+        """Returns the distribution of these settings on a grid."""
         return ViewDistribution(settings, height, width, self.device)
 
     def make_space(self, settings: ViewSpaceSettings) -> ViewSpace:
@@ -139,7 +138,7 @@ class ViewMazeTask(GridTask):
 
     @property
     def target_shares(self) -> Tensor:
-        """Returns the share of the target's levels that is nearest to each bin: float [N]."""
+        """Returns the share of the target's levels nearest to each bin: float [N]."""
         levels = self.target.sample(LOCATING, Streams(0, "target_shares").generator())
         shares: Tensor = self.space.shares(levels)
         return shares
@@ -163,7 +162,7 @@ class ViewMazeTask(GridTask):
         return torch.cat([drawn, went.unsqueeze(-3)], -3)
 
     def at_once(self, cells: int) -> int:
-        """Returns how many levels are evaluated together."""
+        """Returns how many levels to evaluate together."""
         return EPISODES_AT_ONCE // self._named_episodes
 
     def results_on(
@@ -173,9 +172,9 @@ class ViewMazeTask(GridTask):
         about: Mapping[str, Mapping[str, int]],
         max_steps: int,
     ) -> Iterator[LevelResult]:
-        """Yields what K Solvers reach in episodes on levels [n] of any one size.
+        """Yields the results of K Solvers in episodes on levels [n] of one size.
 
-        ``success``, the share of episodes that reached the goal, with the bounds of its 95 %
+        They are ``success``, the share of episodes that reach the goal, the bounds of its 95 %
         interval (Wilson 1927), ``success_low`` and ``success_high``, and ``return``, the mean.
         """
         episodes, generator = self._named_episodes, self._draws.generator(next(iter(about)))
@@ -203,14 +202,14 @@ class ViewMazeTask(GridTask):
 
 
 class ViewBoard(Drawings):
-    """Mazes seen through a window; a :class:`~proposer_rl.task.Board` without policy and maps.
+    """Shows episodes in partially observable mazes; a :class:`~proposer_rl.task.Board`.
 
-    What a Solver does in a cell depends on what it remembers, so that only episodes can be shown.
+    An action depends on a Solver's memory and not on the cell alone, so there are no maps.
 
     Args:
-        task: whose levels are drawn.
+        task: the task of the levels.
         episodes: played on a level to measure a Solver.
-        streams: that actions are drawn from, as ``bin/eval`` draws them.
+        streams: of the actions, the same as in ``bin/eval``.
     """
 
     kinds = (
@@ -228,9 +227,9 @@ class ViewBoard(Drawings):
     def examine(
         self, agent: ActorCritic, solver: int, level: ViewLevel, max_steps: int | None
     ) -> dict[str, Any]:
-        """Returns what a Solver does on a level, by playing; see :class:`~proposer_rl.task.Board`.
+        """Returns a Solver's episodes on a level; see :class:`~proposer_rl.task.Board`.
 
-        ``results``: means over sampled episodes, those of ``bin/eval`` on a level named ``drawn``.
+        ``results`` are means over sampled episodes, those of ``bin/eval`` on a level ``drawn``.
         """
         limit = max_steps or self._task.step_limit(int(view_env.fewest_actions(level)))
         goal, following = level.goal.tolist(), _following(level)
@@ -262,7 +261,7 @@ class ViewBoard(Drawings):
 
 
 def _following(level: ViewLevel) -> list[list[int]]:
-    """Returns where each action leads, [3][H * W * 4]; four directions for each cell."""
+    """Returns the node after each action, [3][H * W * 4], with four directions for each cell."""
     moved = successors(level).tolist()  # [4][H * W], in the order of MOVES
     ahead = [moved[MOVES.index(step)] for step in AHEAD]
     cells, ways = range(len(moved[0])), range(len(AHEAD))
@@ -271,7 +270,7 @@ def _following(level: ViewLevel) -> list[list[int]]:
 
 
 def _shortest(level: ViewLevel, following: list[list[int]]) -> list[Node] | None:
-    """Returns a way of fewest actions, start and goal included; None where there is none."""
+    """Returns the nodes of a path of fewest actions; None if there is none."""
     width = level.walls.shape[1]
     start, goal = (int(cell_index(cell, width)) for cell in (level.start, level.goal))
     way = shortest_way(following, 4 * start + int(level.direction), lambda n: n // 4 == goal)

@@ -1,4 +1,4 @@
-"""The partially observable maze in TorchRL, a network that sees it, and where Solvers walk."""
+"""Steps partially observable mazes in TorchRL, and plays Solvers with memory in them."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ LEFT, RIGHT, FORWARD = range(VIEW_ACTIONS)
 
 EMPTY_OBJECT, WALL_OBJECT, GOAL_OBJECT = 1, 2, 8  # MiniGrid's numbers
 VIEW = 5  # cells on a side of what is seen
-RIM = VIEW - 1  # of walls around the grid, so that all that is seen is in memory
-AGENT_PLACE = (VIEW // 2, VIEW - 1)  # where the agent is in its view
-PENALTY = 0.9  # of the reward, lost by reaching the goal at the step limit
+RIM = VIEW - 1  # of walls around the grid, so that every view is within it
+AGENT_PLACE = (VIEW // 2, VIEW - 1)  # of the agent in its view
+PENALTY = 0.9  # lost from the reward at the step limit
 
 
 @signed
 class ViewMazeEnv(LevelEnv):
-    """The maze of PAIRED, PLR, ACCEL, SFL and their libraries; a batch of them.
+    """A batch of the partially observable mazes of PAIRED, PLR, ACCEL, SFL and their libraries.
 
     - Action: int64 ``[*B]``, 0 turn left, 1 turn right, 2 move forward. A move into an obstacle or
       out of the grid leaves the agent where it is.
-    - Observation, what a Solver sees: ``"view"``, uint8 ``[*B, 5, 5]``, and ``"direction"``, int64
-      ``[*B]``, 0 right, 1 down, 2 left, 3 up. The view shows the cells before the agent: 1 empty, 2
-      wall, 8 goal, as MiniGrid's ``image[:, :, 0]`` with ``agent_view_size=5`` and
-      ``see_through_walls=True``, as PLR, ACCEL and SFL have it. The first index runs from the
-      agent's left to its right, the second from afar to near; the agent is at ``[2, 4]`` and not
-      shown. Walls hide nothing; outside of the grid there are walls.
-    - State besides: ``"agent"``, ``"step_count"``, and ``"is_init"``, bool ``[*B, 1]``, whether an
-      episode begins, as TorchRL calls it.
+    - Observation: ``"view"``, uint8 ``[*B, 5, 5]``, and ``"direction"``, int64 ``[*B]``, 0 right, 1
+      down, 2 left, 3 up. The view shows the cells in front of the agent: 1 empty, 2 wall, 8 goal,
+      as MiniGrid's ``image[:, :, 0]`` with ``agent_view_size=5`` and ``see_through_walls=True``, as
+      in PLR, ACCEL and SFL. The first index runs from the agent's left to its right, the second
+      from far to near; the agent at ``[2, 4]`` is not shown. Walls hide nothing, and outside of the
+      grid there are walls.
+    - Further state: ``"agent"``, ``"step_count"``, and ``"is_init"``, bool ``[*B, 1]``, whether an
+      episode begins.
     - Reward: float32 ``[*B, 1]``, 1 - 0.9 t / ``max_steps`` on entering the goal with step t, else
       0.
     - End: ``terminated`` on reaching the goal; ``truncated`` when the step limit is reached
       elsewhere.
 
     Args:
-        levels: As of :class:`~proposer_rl.tasks.mazes.maze_env.LevelEnv`.
+        levels: As in :class:`~proposer_rl.tasks.mazes.maze_env.LevelEnv`.
         max_steps: Step limit of an episode.
 
     Example:
@@ -72,9 +72,9 @@ class ViewMazeEnv(LevelEnv):
         )
 
     def _tabulate(self, levels: ViewLevel) -> None:
-        """Takes levels up as one line of objects, of all grids with their rims one after another.
+        """Lays all grids with their rims out as one line of objects.
 
-        A place is a number of a cell in that line.
+        A place is the number of a cell in that line.
         """
         device, count = self.device, self.batch_size.numel()
         rows, width = (side + 2 * RIM for side in self._grid)
@@ -135,15 +135,15 @@ class ViewMazeEnv(LevelEnv):
 
 @cache
 def _directions(width: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Tabulates what actions and directions mean in a line of grids of some width.
+    """Tabulates the effects of actions and directions in a line of grids of some width.
 
-    Made once: from numbers of the host, which a recorded reset must not ask for.
+    Tables are made once, since a recorded reset must not read numbers of the host.
 
     Returns:
-        Of each action in each direction, first if nothing is in the way and then if there is, int64
-        [2 * 3 * 4, 4]: the direction after it, the change of place, and the move; of the former the
-        changes of place alone, [3 * 4]; and the changes of place from the agent to the cells that
-        it sees, of each direction, int32 [4, 25].
+        For each action in each direction, first if nothing is in the way and then if a wall is,
+        int64 [2 * 3 * 4, 4]: the direction after it, the change of place, and the move. The changes
+        of place alone if nothing is in the way, [3 * 4]. And the changes of place from the agent to
+        the cells in its view for each direction, int32 [4, 25].
     """
     ahead, none = torch.tensor(AHEAD), torch.zeros(len(AHEAD), 2, dtype=torch.int64)
     each = torch.arange(len(AHEAD))
@@ -157,14 +157,14 @@ def _directions(width: int, device: torch.device) -> tuple[Tensor, Tensor, Tenso
     free = torch.cat([turned.view(-1, 1), cell_index(moves, width).unsqueeze(1), moves], 1)
     blocked = free * torch.tensor([1, 0, 0, 0])
     changes, meaning = free[:, 1].contiguous(), torch.cat([free, blocked])
-    # int32: half the memory to go through.
+    # int32 is half the memory to read.
     seen = cell_index(seen, width).flatten(1).int()
     return meaning.to(device), changes.to(device), seen.to(device)
 
 
 @settings
 class ViewNetworkSettings:
-    """The Solver's network.
+    """Settings of the Solver's network.
 
     Attributes:
         channels: of the convolution.
@@ -180,14 +180,14 @@ class ViewNetworkSettings:
 
 
 VIEW_ENTRIES = ("view", "direction")
-SCALE = 10  # that the field divides MiniGrid's numbers by
+SCALE = 10  # by which the field divides MiniGrid's numbers
 GREY_COLOUR, GREEN_COLOUR = 5, 1  # MiniGrid's colours of walls and goal
 
 
 class ViewEncoder(nn.Module):
-    """Features of views and directions.
+    """Makes features of views and directions.
 
-    The convolution sees MiniGrid's numbers of objects and of their colours, a tenth of them, as in
+    The convolution gets MiniGrid's numbers of objects and of their colours, divided by ten as in
     the field. The third number, a door's state, is zero everywhere and left out.
 
     Args:
@@ -206,7 +206,7 @@ class ViewEncoder(nn.Module):
         self.features = channels * (VIEW - 2) ** 2 + direction
 
     def codes(self, view: Tensor, direction: Tensor) -> Tensor:
-        """Returns codes int64 [N], equal where both views and directions are equal."""
+        """Returns codes int64 [N] that are equal for equal views and directions."""
         digits = ((view & WALL_OBJECT) >> 1) | ((view & GOAL_OBJECT) >> 2)
         base = 4 ** torch.arange(VIEW**2, device=view.device)
         return (digits.flatten(1) * base).sum(1) * len(AHEAD) + direction
@@ -228,9 +228,9 @@ def view_network(settings: ViewNetworkSettings) -> MemoryNetwork:
 
 
 def fewest_actions(levels: ViewLevel) -> Tensor:
-    """Returns how many actions, turns and moves, a shortest way to the goal has.
+    """Returns the number of actions, turns and moves, on a shortest way to the goal.
 
-    A frontier spreads over all pairs of a cell and a direction at once.
+    The search spreads a frontier over all pairs of a cell and a direction.
 
     Args:
         levels: Levels ``[*B]``.
@@ -239,7 +239,7 @@ def fewest_actions(levels: ViewLevel) -> Tensor:
         int64 ``[*B]``, -1 where the goal cannot be reached.
 
     Example:
-        Three times a turn and a move:
+        A turn and a move, three times:
 
         >>> fewest_actions(ViewLevel.from_text('''
         ... ^.#
@@ -269,7 +269,7 @@ def fewest_actions(levels: ViewLevel) -> Tensor:
 
 
 def optimal_view_return(levels: ViewLevel, max_steps: int = 250) -> Tensor:
-    """Returns the largest expected return of any policy, that of a shortest way within the limit.
+    """Returns the largest expected return of any policy, which follows a shortest way.
 
     Args:
         levels: Levels ``[*B]``; the goal need not be reachable.
@@ -287,17 +287,17 @@ def optimal_view_return(levels: ViewLevel, max_steps: int = 250) -> Tensor:
 def walks(
     agent: ActorCritic, levels: ViewLevel, max_steps: int, noise: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Plays one episode of K Solvers on each level, and returns where they go.
+    """Plays an episode of K Solvers on each level, and returns their paths.
 
     Args:
         agent: K Solvers.
         levels: Levels ``[N]``.
         max_steps: Step limit T of an episode.
-        noise: Of the actions, float ``[T, N]``, 0 to 1; None for the most probable ones.
+        noise: For sampled actions, float ``[T, N]``, 0 to 1; None for the most probable ones.
 
     Returns:
         Row, column and direction before every step and at the end, int64 ``[K, N, T + 1, 3]``, and
-        the number of steps, int64 ``[K, N]``; what comes after them has no meaning.
+        the number of steps, int64 ``[K, N]``. Entries after these steps have no meaning.
     """
     every = levels.expand(agent.copies, *levels.batch_size)
     first = torch.cat([every.start, every.direction.unsqueeze(-1)], -1)  # [K, N, 3]
@@ -307,7 +307,7 @@ def walks(
     def env(place: Tensor) -> ViewMazeEnv:
         return ViewMazeEnv(every[:, place], max_steps=max_steps)
 
-    if not len(levels):  # of which there is no environment
+    if not len(levels):  # there is no environment of none
         return went, steps
     begin = env(torch.arange(len(levels), device=first.device))
     for step, (place, state, counts) in enumerate(
@@ -319,11 +319,10 @@ def walks(
 
 
 def visits(agent: ActorCritic, levels: ViewLevel, max_steps: int) -> Tensor:
-    """Returns which cells of levels [C] K Solvers visit by their most probable actions.
+    """Returns the cells of levels [C] that K Solvers visit by their most probable actions.
 
     Returns:
-        Share of the steps of one episode after which an agent is in each cell, float32
-        ``[K, C, H, W]``.
+        Share of an episode's steps that end in each cell, float32 ``[K, C, H, W]``.
     """
     went, steps = walks(agent, levels, max_steps)
     seen = torch.zeros(*went.shape[:2], *levels.walls.shape[-2:], device=went.device)

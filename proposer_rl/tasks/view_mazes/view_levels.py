@@ -1,6 +1,7 @@
-"""Levels in which an agent looks in a direction, and distributions of them.
+"""Draws levels in which an agent looks in a direction.
 
-Drawn levels ``[N]`` are on the CPU, with height x width cells; so is the generator ``draw``.
+Functions that draw return levels ``[N]`` of height x width cells. These and the generator ``draw``
+are on the CPU.
 """
 
 from __future__ import annotations
@@ -19,20 +20,20 @@ from proposer_rl.tasks.mazes.generation import generate_levels
 from proposer_rl.tasks.mazes.levels import START, Level, cell_position, shortest_path_length
 
 AGENTS = (">", "v", "<", "^")
-"""The agent in a drawing, by its direction: 0 right, 1 down, 2 left, 3 up."""
+"""Characters of the agent in a drawing, by direction: 0 right, 1 down, 2 left, 3 up."""
 
 AHEAD = ((0, 1), (1, 0), (0, -1), (-1, 0))
-"""Change of row and column on moving forward, by direction."""
+"""Change of row and column by a move forward, by direction."""
 
-ENDPOINTS = 2  # cells that are no walls: start and goal
+ENDPOINTS = 2  # start and goal, which are no walls
 Walls = Annotated[int, Ge(0)]
 
 
 class ViewLevel(Level):
     """Mazes whose agent begins in a direction, of any batch shape ``[*B]``.
 
-    In a drawing the start is one of ``>``, ``v``, ``<`` and ``^``, the direction in which the agent
-    looks; with an ``S`` it looks to the right.
+    In a drawing the start is ``>``, ``v``, ``<`` or ``^`` by the agent's direction; with an ``S``
+    the agent looks to the right.
 
     Attributes:
         direction: int64 ``[*B]``, 0 right, 1 down, 2 left, 3 up.
@@ -67,7 +68,7 @@ class ViewLevel(Level):
 
 
 def directed(level: Level, direction: Tensor) -> ViewLevel:
-    """Returns levels [*B] with the directions in which their agents begin, int64 [*B]."""
+    """Returns levels [*B] with the first directions of their agents, int64 [*B]."""
     return ViewLevel(
         walls=level.walls,
         start=level.start,
@@ -79,10 +80,10 @@ def directed(level: Level, direction: Tensor) -> ViewLevel:
 
 @settings
 class ScatteredSettings:
-    """Walls anywhere; each number of them from ``fewest`` to ``most`` is equally likely.
+    """Walls anywhere, with equally likely numbers of them from ``fewest`` to ``most``.
 
     Attributes:
-        solvable: whether levels are drawn again whose goal cannot be reached.
+        solvable: whether to draw a level again if its goal cannot be reached.
     """
 
     kind: Literal["scattered"] = "scattered"
@@ -93,14 +94,14 @@ class ScatteredSettings:
 
 @settings
 class PerfectSettings:
-    """Mazes with one way between any two cells."""
+    """Mazes with exactly one path between any two cells."""
 
     kind: Literal["perfect"] = "perfect"
 
 
 @settings
 class RoomsSettings:
-    """Four rooms with a door between any two neighbours."""
+    """Four rooms with a door between neighbours."""
 
     kind: Literal["four_rooms"] = "four_rooms"
 
@@ -110,12 +111,12 @@ ViewDistributionSettings = Annotated[ScatteredSettings | PerfectSettings | Rooms
 
 @settings
 class ViewSpaceSettings:
-    """The Proposer's bins.
+    """Settings of the Proposer's bins.
 
     Attributes:
         walls: numbers of walls.
-        path_lengths: moves on the shortest path, each with each of the numbers; None for start and
-            goal anywhere, as in the field.
+        path_lengths: moves on the shortest path, each with every number of walls; None for start
+            and goal anywhere, as in the field.
     """
 
     walls: Annotated[list[Walls], Len(1)]
@@ -123,12 +124,12 @@ class ViewSpaceSettings:
 
 
 class ViewDistribution:
-    """Levels of one kind.
+    """A distribution of levels.
 
     Args:
-        settings: the kind.
+        settings: the kind of levels.
         height, width: of the grid.
-        device: where the levels are returned.
+        device: of the levels.
 
     Raises:
         ValueError: if there are no such levels on this grid.
@@ -143,7 +144,7 @@ class ViewDistribution:
         self.sample(1, torch.Generator().manual_seed(0))
 
     def sample(self, count: int, generator: torch.Generator) -> ViewLevel:
-        """Draws levels [count]; the generator is one of the CPU."""
+        """Draws levels [count] by a generator on the CPU."""
         return self._draw(count, generator).to(self._device)
 
     def _draw(self, count: int, generator: torch.Generator) -> ViewLevel:
@@ -169,25 +170,25 @@ class ViewDistribution:
 
 
 class ViewSpace:
-    """Bins of levels: every number of walls, or each of these with every length of the path.
+    """Bins of levels by their number of walls, and perhaps by the length of their shortest path.
 
-    Without lengths start and goal are anywhere, and may have no path between them: levels drawn
+    Without lengths start and goal are anywhere, perhaps without a path between them: levels drawn
     uniformly from all bins are domain randomization as in PLR, ACCEL and SFL. With lengths every
     level has a shortest path of exactly so many moves.
 
     Args:
         settings: numbers and lengths.
         height, width: of the grid.
-        device: where the levels are returned.
+        device: of the levels.
 
     Attributes:
         axes: the values along each axis, by name.
         size: number N of bins.
-        coordinates: of each bin, scaled to [-1, 1] along every axis, 0 where it has one value,
-            float32 [N, D].
+        coordinates: of each bin, scaled to [-1, 1] along every axis, or 0 along one of a single
+            value, float32 [N, D].
 
     Raises:
-        ValueError: if there are no levels of a bin.
+        ValueError: if a bin has no levels.
     """
 
     def __init__(
@@ -211,23 +212,23 @@ class ViewSpace:
         return self.generate(choices, [generator])[0]
 
     def generate(self, choices: Tensor, generators: Sequence[torch.Generator]) -> ViewLevel:
-        """Draws levels [K, P] of bins, int64 [K, P]; row k by generator k."""
+        """Draws levels [K, P] from bins, int64 [K, P]; generator k draws row k."""
         pairs = zip(choices.cpu(), generators, strict=True)
         levels = [self._generate(self._values[index], draw) for index, draw in pairs]
         return torch.stack(levels).to(self._device)  # type: ignore[arg-type, return-value]
 
     def locate(self, levels: ViewLevel) -> Tensor:
-        """Returns where levels [*B] lie, as the coordinates: float32 [*B, D] on the CPU.
+        """Returns the coordinates of levels [*B]: float32 [*B, D] on the CPU.
 
-        A goal that cannot be reached counts as far away as there are cells.
+        The path length to a goal that cannot be reached counts as the number of cells.
         """
         counts = self._counts(levels)
         return self._scaled(counts.where(counts >= 0, math.prod(self._grid)))
 
     def shares(self, levels: ViewLevel) -> Tensor:
-        """Returns the share of levels [n] nearest to each bin, float32 [N], of solvable ones.
+        """Returns the share of levels [n] nearest to each bin: float32 [N].
 
-        Without lengths all of the levels count.
+        With lengths only solvable levels count.
         """
         counts = self._counts(levels)
         distance = torch.cdist(self._scaled(counts), self.coordinates)
@@ -235,7 +236,7 @@ class ViewSpace:
         return nearest.bincount(minlength=self.size) / len(nearest)
 
     def _counts(self, levels: ViewLevel) -> Tensor:
-        """Returns levels' walls, and path lengths (-1 for none) if an axis: int64 [*B, D]."""
+        """Returns numbers of walls, and path lengths (-1 for none) if an axis: int64 [*B, D]."""
         counts = [levels.walls.flatten(-2).sum(-1)]
         if "path length" in self.axes:
             counts.append(shortest_path_length(levels))
@@ -261,14 +262,14 @@ def _check_walls(most: int, height: int, width: int) -> None:
         )
 
 
-MOST_DRAWS = 1000  # of a level whose goal is to be reachable
+MOST_DRAWS = 1000  # of a level until its goal can be reached
 
 
 def scattered_walls(count: Tensor, height: int, width: int, draw: torch.Generator) -> ViewLevel:
-    """Draws levels with exact numbers of walls; all cells and the direction are uniform.
+    """Draws levels with exact numbers of walls, uniform cells and uniform directions.
 
-    Nothing else is asked of them: the goal may be out of reach, as in PLR's and jaxued's. The
-    numbers are int64 ``[N]`` on the CPU, at most height * width - 2.
+    The goal may be out of reach, as in PLR's and jaxued's levels. The numbers are int64 ``[N]`` on
+    the CPU, at most height * width - 2.
     """
     order = torch.rand(len(count), height * width, generator=draw).argsort(1)
     # The first two cells of a random order are start and goal, the next ones walls.
@@ -349,7 +350,7 @@ def solvable(draw_levels: Callable[[int], ViewLevel], number: int) -> ViewLevel:
 
 
 def _placed(walls: Tensor, draw: torch.Generator) -> ViewLevel:
-    """Returns levels of walls [N, H, W] with different uniform free cells as start and goal."""
+    """Returns levels of walls [N, H, W] with two uniform free cells as start and goal."""
     chance = torch.rand(walls.flatten(1).shape, generator=draw)
     ends = chance.where(~walls.flatten(1), -1.0).topk(2, 1).indices
     return _level_of(walls, ends, draw)

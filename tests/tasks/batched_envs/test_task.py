@@ -68,13 +68,10 @@ def test_its_title_target_and_levels_are_told() -> None:
 @pytest.mark.parametrize(
     ("word", "said"),
     [
-        ("task.env=nowhere.at.All", "env: 'nowhere.at.All': cannot be imported"),
-        ("task.env=tests.tasks.batched_envs.toys.Nobody", "cannot be imported: module"),
+        ("task.env=nowhere.at.All", "env: 'nowhere.at.All' cannot be imported"),
         ("task.env=torch.nn.Linear", "task.env='torch.nn.Linear': must be a subclass of Batched"),
-        ("task.env=tests.tasks.batched_envs.toys.windy_task", "must be a subclass of BatchedEnv"),
         ("task.max_steps=0", "task.max_steps=0: "),
         ("task.parameters.wind.low=3", "task.parameters.wind: low=3"),
-        ("task.parameters.wind.target=[1, 2, 3]", "task.parameters.wind: target="),
     ],
 )
 def test_what_is_no_environment_is_refused(

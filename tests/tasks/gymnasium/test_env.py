@@ -20,8 +20,8 @@ from torchrl.envs.utils import check_env_specs
 from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium import batched_env
-from proposer_rl.tasks.gymnasium.answers import Step, SuccessSettings
 from proposer_rl.tasks.gymnasium.batched_env import GymnasiumEnv, LostProcessError
+from proposer_rl.tasks.gymnasium.environment import SuccessSettings
 from proposer_rl.tasks.gymnasium.player import GymLevel, LevelPlayer, MakeEnvironment
 from proposer_rl.tasks.parameters import ParameterSpace
 from tests.processes import ROOT
@@ -145,7 +145,7 @@ def test_locks_that_are_held_while_its_processes_start_are_free_in_them() -> Non
 
 SCRIPT = """
 import gymnasium, numpy, proposer_rl.tasks.gymnasium.batched_env as batched, torch
-from proposer_rl.tasks.gymnasium.answers import SuccessSettings
+from proposer_rl.tasks.gymnasium.environment import SuccessSettings
 from proposer_rl.tasks.gymnasium.player import MakeEnvironment
 from proposer_rl.tasks.parameters import ParameterSpace
 SPACE = gymnasium.spaces.Box(-1, 1, (2,), numpy.float32)
@@ -189,10 +189,10 @@ def test_levels_are_taken_up_at_the_next_reset() -> None:
 
 
 STEPS = [  # ended by the environment, by the time limit, by both, cut off before
-    Step(True, False, True, 3.0, {"won": 1}),
-    Step(False, True, False, 5.0, {"won": 0}),
-    Step(True, True, False, 1.0, {"won": 1, "deep": {"er": True}}),
-    Step(False, True, True, 9.0, {}),
+    (True, False, True, 3.0, {"won": 1}),
+    (False, True, False, 5.0, {"won": 0}),
+    (True, True, False, 1.0, {"won": 1, "deep": {"er": True}}),
+    (False, True, True, 9.0, {}),
 ]
 
 
@@ -207,7 +207,7 @@ STEPS = [  # ended by the environment, by the time limit, by both, cut off befor
     ],
 )
 def test_successes(settings: Any, expected: list[bool]) -> None:
-    assert [SuccessSettings(**settings)(step) for step in STEPS] == expected
+    assert [SuccessSettings(**settings)(*step) for step in STEPS] == expected
 
 
 @pytest.mark.parametrize("reward", [0.1, np.float32(0.7), -0.1])
@@ -217,19 +217,13 @@ def test_a_return_is_reached_up_to_rounding(reward: Any) -> None:
     player = LevelPlayer(MakeEnvironment(env, max_steps=10), {}, GymLevel({}, 0), rule)
     player.reset()
     assert [player.step(0)[4] for _ in range(10)] == [*[{}] * 9, {"success": True}]
-    assert not rule(Step(True, False, True, rule.least - 1e-4, {}))  # type: ignore[operator]
+    assert not rule(True, False, True, rule.least - 1e-4, {})  # type: ignore[operator]
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"kind": "return"}, "least: missing"),
-        ({"kind": "info"}, "key: missing"),
-    ],
-)
-def test_success_has_what_its_kind_needs(settings: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        SuccessSettings(**settings)
+@pytest.mark.parametrize(("kind", "needed"), [("return", "least"), ("info", "key")])
+def test_success_has_what_its_kind_needs(kind: Any, needed: str) -> None:
+    with pytest.raises(ValueError, match=f"{needed}: missing"):
+        SuccessSettings(kind=kind)
 
 
 RULES = [

@@ -23,6 +23,7 @@ SPACE = ParameterSpace(BINS)
 
 
 RANGE = {"low": 0.0, "high": 3.0}
+FOUR = {"low": -4.0, "high": 4.0, "bins": 4}
 
 
 def test_bins_stand_for_their_middles_and_the_last_parameter_runs_fastest() -> None:
@@ -90,23 +91,14 @@ def test_a_range_is_divided_among_the_bins_that_it_covers(
 @pytest.mark.parametrize(
     ("range_", "target", "mass"),
     [
-        (
-            {"low": -4.0, "high": 4.0, "bins": 4},
-            {"distribution": "norm", "loc": 1.0, "scale": 2.0},
-            lambda a, b: norm_mass(a, b, 1.0, 2.0),
-        ),
-        (
-            {"low": -4.0, "high": 4.0, "bins": 4},
-            {"values": [-3.0, -2.5, 3.0], "weights": [1.0, 2.0, 5.0]},
-            lambda a, b: {-4.0: 3 / 8, 2.0: 5 / 8}.get(a, 0.0),
-        ),
-        (
-            {"values": [1, 2, 4]},
-            {"values": [1, 4], "weights": [3, 1]},
-            lambda a, b: {1: 3 / 4, 4: 1 / 4}.get(a, 0.0),
-        ),
+        (FOUR, {"distribution": "norm", "loc": 1.0, "scale": 2.0},
+         lambda a, b: norm_mass(a, b, 1.0, 2.0)),
+        (FOUR, {"values": [-3.0, -2.5, 3.0], "weights": [1.0, 2.0, 5.0]},
+         lambda a, b: {-4.0: 3 / 8, 2.0: 5 / 8}.get(a, 0.0)),
+        ({"values": [1, 2, 4]}, {"values": [1, 4], "weights": [3, 1]},
+         lambda a, b: {1: 3 / 4, 4: 1 / 4}.get(a, 0.0)),
     ],
-)
+)  # fmt: skip
 def test_a_target_may_be_any_distribution(range_: dict, target: dict, mass: Any) -> None:
     settings = ParameterSettings(**range_, target=target)
     bins, law = settings.space_bins(), settings.target_bins()
@@ -153,7 +145,6 @@ def test_a_single_bin_lies_in_the_middle() -> None:
         ({"target": 4, "values": [1, 2]}, r"target=4: must be among \[1, 2\]"),
         ({"target": {"values": [4], "weights": [1]}, "values": [1]}, r"target.values=\[4\]: must"),
         ({"target": [2.0, 1.0], **RANGE}, r"target=\(2.0, 1.0\): low=2.0 must be below high=1.0"),
-        ({"target": [0.0, 1.0, 2.0], **RANGE}, "must be a number or"),
         ({"target": {"distribution": "gamma"}, **RANGE}, "distribution='gamma': input should be"),
         ({"target": {"distribution": "norm", "skale": 1}, **RANGE}, "target.skale: unknown; there"),
         ({"target": {"distribution": "norm"}, "values": [1.0]}, "of a continuous range only"),
@@ -170,6 +161,15 @@ def test_what_makes_no_bins_is_refused(given_: dict, message: str) -> None:
     assert "\n" not in str(refused.value)
 
 
+def test_a_file_names_a_part_of_a_range_by_its_ends_and_single_values_by_more() -> None:
+    part, three = (
+        ParameterSettings(**RANGE, target=target).target_bins()
+        for target in ([1.0, 2.0], [0.5, 1.0, 2.0])
+    )
+    assert (part.low.tolist(), part.high.tolist()) == ([1.0], [2.0])
+    assert three.low.tolist() == three.high.tolist() == [0.5, 1.0, 2.0]
+
+
 @pytest.mark.parametrize(
     ("target", "outside"),
     [
@@ -184,7 +184,7 @@ def test_a_target_beyond_the_range_is_told(target: Any, outside: bool) -> None:
         warnings.simplefilter("always")
         spaces({"mass": ParameterSettings(**RANGE, target=target)})
     assert len(told) == outside
-    assert all("lies outside of low=0 to high=3, which" in str(one.message) for one in told)
+    assert all("lies outside of low=0 to high=3, from which" in str(one.message) for one in told)
 
 
 def test_without_parameters_levels_lie_along_no_axis() -> None:

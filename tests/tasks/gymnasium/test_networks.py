@@ -15,7 +15,7 @@ from torchrl.data import Categorical, MultiCategorical, TensorSpec, Unbounded
 
 from proposer_rl.models import Population, draw_at, joint_categorical, normal
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings, SolverNetwork
-from proposer_rl.tasks.gymnasium.spaces import Layout, in_order, typed
+from proposer_rl.tasks.gymnasium.spaces import Layout, cast_to, in_order
 from tests.tasks.gymnasium.odd import Mixed
 
 SETTINGS = NetworkSettings(hidden=[16, 8], channels=[4, 6])
@@ -181,6 +181,6 @@ def reordered(seen: Any) -> Any:
 @given(NESTED)
 def test_all_numbers_are_seen_whatever_their_names_are(space: Any) -> None:
     layout, seen = Layout(space, spaces.Discrete(2)), space.sample()
-    shown = entries(layout, typed(space, reordered(seen)))["observation"].tolist()
+    shown = entries(layout, cast_to(space, reordered(seen)))["observation"].tolist()
     assert sorted(shown) == sorted(spaces.flatten(space, seen))
     assert entries(layout, seen)["observation"].tolist() == shown

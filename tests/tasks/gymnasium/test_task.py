@@ -45,7 +45,6 @@ def one(**given: Any) -> dict[str, Any]:
 
 
 HERE = "tests.tasks.gymnasium.test_task"
-FALLING = ParameterSettings(values=[2.0, 1.0], target=1.0)
 NEGATIVE = ParameterSettings(set="argument", low=-1.0, high=2.0, bins=2, target=1.0)
 SIZES = ParameterSettings(set="argument", values=[3, 5], target=3)
 WRONG: list[tuple[dict[str, Any], str]] = [
@@ -53,23 +52,18 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"env_id": "nowhere:Walk-v0"},
      "env_id=nowhere:Walk-v0: No module named 'nowhere'.*cannot find it: install it there"),
     ({"parameters": {"seed": PARAMETERS["width"]}}, "parameters.seed: is a column of training.csv"),
-    ({"parameters": {"width": FALLING}}, r"parameters.width: values=\[2.0, 1.0\] must rise"),
     (one(), "parameters.a: Walk has no attribute 'a'; numbers that it has: width, wind"),
     ({"parameters": {"width": NEGATIVE}},
-     r"parameters: .*Walk-v0 refuses width=-1, seed=\d+: ValueError: width must .*\(toys"),
-    (one(set="call", name="nowhere.f"), "parameters: .*ValueError: 'nowhere.f': cannot be"),
-    (one(set="call"), "parameters: .*ValueError: 'a': cannot be imported"),
+     r"env_id=.*: the constructor raises ValueError: width .*\(toys.*level width=-1, seed=\d+"),
+    (one(set="call", name="nowhere.f"),
+     "parameters.a: 'nowhere.f' cannot be imported: No module named 'nowhere'$"),
     ({"wrappers": [f"{HERE}.with_whole_actions"]},
      r"action space Box.*int64\): there is a policy for .* a Box of floats"),
     ({"env_id": "tests.tasks.gymnasium.broken:Walk-v0", "parameters": {}},
-     r"env_id=.*: it cannot be made: ZeroDiv.* \(broken.py, line \d+\)$"),
-    ({"parameters": {"a,b": PARAMETERS["width"]}}, "parameters.a,b: must be a name of letters"),
-    ({"wrappers": ["nowhere.Wrapper"]}, "wrappers: nowhere.Wrapper: .*cannot be imported"),
-    ({"arguments": {"foo": 1}}, "parameters: .*refuses .*unexpected keyword"),
-    ({"arguments": {"foo": 1}, "parameters": {}},
-     "env_id=.*: it cannot be made: TypeError: .*unexpected keyword"),
+     r"env_id=.*: the constructor raises ZeroDiv.* \(broken.py, line \d+\), on the level"),
+    ({"arguments": {"foo": 1}}, "env_id=.*: the constructor raises TypeError: .*unexpected"),
     ({"env_id": f"{HERE}:Grown-v0", "parameters": {"size": SIZES}},
-     "parameters.size: all levels must show and take the same, but 5 changes"),
+     "parameters.size: all levels must have the same spaces, but 5 changes"),
     ({"env_id": f"{HERE}:Endless-v0"}, "max_steps: missing"),
 ]  # fmt: skip
 
@@ -361,7 +355,7 @@ def test_texts_and_truth_values_are_set_tried_and_shown_as_they_are() -> None:
     }  # fmt: skip
     # A belief sees which of them it is, so that none lies between two others.
     assert task.space.inputs(levels[0, :2]).tolist() == [[1, 0, 0, 1, 0], [0, 0, 1, 0, 1]]
-    with pytest.raises(ValueError, match=r"refuses material=clay, wet=True, seed=\d+: ValueError"):
+    with pytest.raises(ValueError, match=r"no crate .*material=clay, wet=True, seed=\d+"):
         walk_task(env_id=env_id, parameters=crates("wood", "clay", "glass"))
     others = walk_task(env_id=env_id, parameters=crates("steel", "wood", "glass"))
     assert others.facts["measured"] != task.facts["measured"]

@@ -13,7 +13,7 @@ import pytest
 
 from proposer_rl.learning import PPOSettings, SolverSettings
 from proposer_rl.task import ComputeContext
-from proposer_rl.tasks.gymnasium.answers import SuccessSettings
+from proposer_rl.tasks.gymnasium.environment import SuccessSettings
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings
 from proposer_rl.tasks.gymnasium.player import ParameterSettings
 from proposer_rl.tasks.gymnasium.task import EvaluationSettings, GymnasiumTask

@@ -13,9 +13,8 @@ from proposer_rl.models import ActorCritic, cell_maps
 from proposer_rl.streams import Streams
 from proposer_rl.task import PlayableTask
 from proposer_rl.tasks.mazes import Level, MazeEnv, planes
-from proposer_rl.tasks.mazes.board import shortest_path
 from proposer_rl.tasks.mazes.drawings import SETS, read_levels
-from proposer_rl.tasks.mazes.task import MazeSettings, MazeTask
+from proposer_rl.tasks.mazes.task import MazeSettings, MazeTask, shortest_path
 from tests.tasks.mazes.oracles import moved, path_length, random_levels
 from tests.tiny import mountain_cars, tiny_task
 

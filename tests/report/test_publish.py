@@ -13,12 +13,11 @@ from pathlib import Path
 import pytest
 
 from proposer_rl.cli.report import main as report
+from proposer_rl.report import publish
 from proposer_rl.report.figures import learning_curves
 from proposer_rl.report.reading import find_runs, read_run
 from proposer_rl.report.runs import tables
 from proposer_rl.report.studies import read_studies
-from research import publish
-from research.publish import main
 from tests.report.folders import LEVEL, cycle, write_run
 
 SECRET = "/home/somebody/code"
@@ -27,7 +26,7 @@ SECRET = "/home/somebody/code"
 @pytest.fixture(autouse=True)
 def without_figures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if "pictures" not in request.keywords:
-        monkeypatch.setattr(publish, "write_page", lambda folder: None)
+        monkeypatch.setattr(publish, "write_page", lambda *_: None)
 
 
 @pytest.fixture
@@ -54,7 +53,7 @@ def runs(tmp_path: Path) -> Path:
 
 
 def published(runs: Path, output: Path) -> Path:
-    main([str(runs), "-o", str(output)])
+    report([str(runs), "--publish", str(output)])
     return output
 
 
@@ -217,16 +216,16 @@ def test_what_cannot_be_published_is_one_line_and_changes_nothing(
     (tmp_path / "mine" / "thesis.tex").write_text("mine")
     (tmp_path / "file").write_text("mine")
     wrong = {
-        "runs: is no study; give a new folder": [runs, runs],
-        "two runs are called target_0: ": [runs, tmp_path / "other", "new"],
-        "mine: is no study": [runs, tmp_path / "mine"],
-        "file: is no study": [runs, tmp_path / "file"],
+        "runs: is not empty, and has no runs.csv.xz; use a new directory": [runs, runs],
+        "two runs have the name target_0: ": [runs, tmp_path / "other", "new"],
+        "mine: is not empty": [runs, tmp_path / "mine"],
+        "file: Not a directory": [runs, tmp_path / "file"],
     }
     for message, (*folders, output) in wrong.items():
         before = contents(tmp_path)
         with pytest.raises(SystemExit) as end:
-            main([*map(str, folders), "-o", str(output)])
-        assert end.value.code == 2
+            report([*map(str, folders), "--publish", str(output)])
+        assert end.value.code == (4 if "file: " in message else 2)
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("error: ") and message in line
         assert contents(tmp_path) == before and not Path("new").exists()
