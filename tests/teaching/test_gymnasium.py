@@ -243,7 +243,7 @@ def fixed(value: Any) -> property:
     [
         (LevelEnv(), "LevelEnv has no attribute 'gravity'"),
         (answering(gravity=fixed(9.8)), "gravity of Odd is 9.8, not "),
-        (PutsBack(answering(gravity=9.8)), "gravity of PutsBack is 9.8, not .*, after a reset"),
+        (PutsBack(answering(gravity=9.8)), "gravity of Odd is 9.8, not .*, after a reset"),
     ],
 )
 def test_an_attribute_that_does_not_get_there_is_found(env: Any, message: str) -> None:
