@@ -183,8 +183,7 @@ def test_others_watch_whole_episodes_elsewhere() -> None:
     after = learner.collect(generators)
     going_on = ~before["next", "done"][:, :, -1, 0]
     assert torch.equal(
-        after["observation"][:, :, 0][going_on],
-        before["next", "observation"][:, :, -1][going_on],
+        after["observation"][:, :, 0][going_on], before["next", "observation"][:, :, -1][going_on]
     )
 
 

@@ -20,7 +20,6 @@ from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, available
 
 # Below these keys are the settings of curricula, most of which are in no file.
 BUILT = ("curriculum.", "filter.", "model.")
-SCALED = "maze"  # the task whose sizes the files of conf/scale set
 # The folders of a sweep are not named after these: they say where a run is computed and shown, or
 # have a place of their own in the name.
 UNNAMED = {"compute", "logger", "method", "seed", "seeds", "sweep"}
@@ -148,13 +147,16 @@ OmegaConf.register_new_resolver(
 
 
 def check_scale(overrides: Sequence[str]) -> None:
-    """Refuses a scale of another task, whose sizes would be merged into this one's."""
+    """Refuses a scale, which is of the default task, for another task of ``conf/``."""
     said = dict(override.split("=", 1) for override in overrides if "=" in override)
-    task, scale = said.get("task", SCALED), said.get("scale")
-    if scale in available("scale") and task in available("task") and task != SCALED:
-        raise ConfigError(
-            f"scale={scale}: is a scale of task={SCALED}; task={task} has sizes of its own"
-        )
+    task, scale = said.get("task"), said.get("scale")
+    if task in available("task") and scale in available("scale"):
+        defaults = OmegaConf.load(CONFIG_FOLDER / "train.yaml").defaults
+        scaled = next(group.task for group in defaults if "task" in group)
+        if task != scaled:
+            raise ConfigError(
+                f"scale={scale}: is a scale of task={scaled}; task={task} has sizes of its own"
+            )
 
 
 def check_chosen(config: DictConfig, hydra: Any) -> None:

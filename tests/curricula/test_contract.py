@@ -200,10 +200,7 @@ class Fewer(c.Curriculum):
             lambda: proposed(Fewer(), c.Student(), 4, Streams(0)),
             "curriculum=Fewer: proposes 3 .* 4",
         ),
-        (
-            lambda: c.Batch(torch.zeros(3), TensorDict({}, [4])),
-            r"notes: have shape \[4\], .* of 3",
-        ),
+        (lambda: c.Batch(torch.zeros(3), TensorDict({}, [4])), r"notes: have shape \[4\], .* of 3"),
         (
             lambda: c.Curriculum().propose(c.Student(), 1, Streams(0)),
             "Curriculum must define propose",

@@ -32,7 +32,6 @@ from proposer_rl.teaching import Items, Parameters, Teacher
 from tests.commands import SMOKE
 from tests.curricula.living import student
 from tests.curricula.scripted import Scripted, reached, step
-from tests.curricula.test_contract import same
 from tests.tiny import TASK, composed, sledges, tiny_view_task
 
 M, F = 40, 5
@@ -254,22 +253,6 @@ def test_it_tells_how_right_it_was() -> None:
     assert levels.sum() == 8 * 32
     assert ((said - was).abs() * levels).sum() / levels.sum() < 0.1
     assert curriculum.log() == {}
-
-
-def test_whole_batches_are_taken_in_one_by_one() -> None:
-    """As by the model itself, also where the log is read in between."""
-    student = Scripted(torch.tensor([0.0, 0.3, 0.7, 1.0]))
-    curriculum, model = scripted_filter(student), OutcomeModel(labels="above_worst")
-    for update in range(5):
-        batch = curriculum.propose(student, 16, Streams(0, "update", update))
-        outcome = reached(torch.rand(16, generator=torch.Generator().manual_seed(update)))
-        curriculum.observe(student, batch, outcome)
-        told = {name: outcome[name].double() for name in ("return", "success")}
-        model.add(space_features(student.space, batch.levels).double(), told)
-        if update % 2:
-            curriculum.log()
-    curriculum.log()
-    assert same(curriculum._model.state_dict(), model.state_dict())
 
 
 def test_success_that_is_not_needed_may_be_told_of_some_levels_alone() -> None:

@@ -81,9 +81,7 @@ def test_each_step_is_in_one_part_of_its_own_replica(make: Callable[..., PPO]) -
     assert torch.equal(torch.cat(drawn, 1).sort().values, number.flatten(1))
 
 
-def test_one_shuffled_part_gives_the_gradient_of_the_whole_batch(
-    make: Callable[..., PPO],
-) -> None:
+def test_one_shuffled_part_gives_the_gradient_of_the_whole_batch(make: Callable[..., PPO]) -> None:
     ppo = make(replace(SETTINGS, minibatches=1))
     rollout = ppo.update(
         generators(*range(K))

@@ -220,16 +220,10 @@ def test_a_return_is_reached_up_to_rounding(reward: Any) -> None:
     assert not rule(True, False, True, rule.least - 1e-4, {})  # type: ignore[operator]
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"kind": "return"}, "least: missing"),
-        ({"kind": "info"}, "key: missing"),
-    ],
-)
-def test_success_has_what_its_kind_needs(settings: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        SuccessSettings(**settings)
+@pytest.mark.parametrize(("kind", "needed"), [("return", "least"), ("info", "key")])
+def test_success_has_what_its_kind_needs(kind: Any, needed: str) -> None:
+    with pytest.raises(ValueError, match=f"{needed}: missing"):
+        SuccessSettings(kind=kind)
 
 
 RULES = [

@@ -23,6 +23,7 @@ SPACE = ParameterSpace(BINS)
 
 
 RANGE = {"low": 0.0, "high": 3.0}
+FOUR = {"low": -4.0, "high": 4.0, "bins": 4}
 
 
 def test_bins_stand_for_their_middles_and_the_last_parameter_runs_fastest() -> None:
@@ -90,23 +91,14 @@ def test_a_range_is_divided_among_the_bins_that_it_covers(
 @pytest.mark.parametrize(
     ("range_", "target", "mass"),
     [
-        (
-            {"low": -4.0, "high": 4.0, "bins": 4},
-            {"distribution": "norm", "loc": 1.0, "scale": 2.0},
-            lambda a, b: norm_mass(a, b, 1.0, 2.0),
-        ),
-        (
-            {"low": -4.0, "high": 4.0, "bins": 4},
-            {"values": [-3.0, -2.5, 3.0], "weights": [1.0, 2.0, 5.0]},
-            lambda a, b: {-4.0: 3 / 8, 2.0: 5 / 8}.get(a, 0.0),
-        ),
-        (
-            {"values": [1, 2, 4]},
-            {"values": [1, 4], "weights": [3, 1]},
-            lambda a, b: {1: 3 / 4, 4: 1 / 4}.get(a, 0.0),
-        ),
+        (FOUR, {"distribution": "norm", "loc": 1.0, "scale": 2.0},
+         lambda a, b: norm_mass(a, b, 1.0, 2.0)),
+        (FOUR, {"values": [-3.0, -2.5, 3.0], "weights": [1.0, 2.0, 5.0]},
+         lambda a, b: {-4.0: 3 / 8, 2.0: 5 / 8}.get(a, 0.0)),
+        ({"values": [1, 2, 4]}, {"values": [1, 4], "weights": [3, 1]},
+         lambda a, b: {1: 3 / 4, 4: 1 / 4}.get(a, 0.0)),
     ],
-)
+)  # fmt: skip
 def test_a_target_may_be_any_distribution(range_: dict, target: dict, mass: Any) -> None:
     settings = ParameterSettings(**range_, target=target)
     bins, law = settings.space_bins(), settings.target_bins()
