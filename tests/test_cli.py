@@ -206,7 +206,7 @@ def test_how_to_go_on_is_a_whole_command(train, monkeypatch, capsys) -> None:
         (told,) = re.findall(r"To go on: (.*)", capsys.readouterr().out)
         path, command, *words = shlex.split(told)
         assert path.startswith("PYTHONPATH=own parts") and command == "bin/train"
-        assert words[:2] == ["--config-dir", "own"] and {*arguments} <= {*words}
+        assert words[:2] == ["--config-dir", "own"] and {*arguments} <= {w.lower() for w in words}
         assert not any(word.startswith("+sweep") for word in words)
         assert folder in words[-1]
 
