@@ -272,9 +272,10 @@ def explained(error: Exception) -> str:
     if isinstance(error, MissingConfigException) and error.options:
         return unknown(str(error.missing_cfg_file), error.options)
     cause: Any = error.__cause__
-    missing, holder = isinstance(cause, AttributeError | KeyError), getattr(cause, "parent_node", 0)
-    if missing and isinstance(holder, Mapping):
-        return unknown(cause.full_key, sorted({*holder} - {"hydra"}))
+    holder = getattr(cause, "parent_node", None)
+    if isinstance(cause, AttributeError | KeyError) and isinstance(holder, Mapping):
+        key = getattr(cause, "full_key", None)
+        return unknown(str(key), sorted({*holder} - {"hydra"}))
     said = getattr(error, "override", None), error, cause
     return ": ".join(" ".join(str(each).split()) for each in said if each)
 

@@ -1,4 +1,4 @@
-"""``bin/eval`` and ``proposer-eval``: the trained Solvers of one run on named levels, one by one.
+"""``bin/eval`` and ``proposer-eval``: evaluate a run's Solvers on named levels, one by one.
 
 Help and refusals come before what takes seconds to import.
 """
@@ -110,7 +110,7 @@ def list_levels(options: argparse.Namespace) -> None:
 
 
 def load(checkpoint: Path) -> tuple[StoredRun, Stage]:
-    """Returns the Solvers of a run's newest checkpoint, or of the one that is given."""
+    """Loads the Solvers of a run's newest checkpoint, or of the checkpoint given."""
     from proposer_rl.cli.stored import stored_run
 
     run = stored_run(checkpoint)
@@ -155,7 +155,7 @@ def _print(evaluation: Evaluation) -> None:
 
 
 def _hardest(results: Sequence[LevelResult]) -> list[list[LevelResult]]:
-    """Returns results by level: of many levels those with the least success, or return.
+    """Groups results by level, and keeps the levels with the least success or return if many.
 
     It is the mean over the Solvers that counts; levels stay in their order.
     """

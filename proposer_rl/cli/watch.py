@@ -1,4 +1,4 @@
-"""``bin/watch`` and ``proposer-watch``: shows running experiments; nothing is written.
+"""``bin/watch`` and ``proposer-watch``: show running experiments; nothing is written.
 
 And the picture and the lines with which a run ends, and the table with which a sweep does: training
 is given them and knows nothing of what draws; figures take a while to import.
@@ -105,7 +105,7 @@ class Progress:
 
     @property
     def state(self) -> str:
-        """The state in a word: failed, finished, unfinished (or running), or starting."""
+        """The state: failed, finished, unfinished (or running), or starting."""
         if self.failure:
             return "failed"
         if not self.runs:
@@ -132,7 +132,7 @@ def find_progress(folder: Path) -> list[Progress]:
     """Returns the states of all runs in a folder, or of the folder itself."""
     found = [read_progress(path) for path in begun(folder)]
     if not found:
-        raise UnreadableRun(f"{folder}: no run in it, finished or begun")
+        raise UnreadableRun(f"{folder}: holds no runs, finished or begun")
     return found
 
 
@@ -156,7 +156,7 @@ def _doing(folder: Path) -> str:
 
 
 def _left(run: Run) -> str:
-    """Returns how long the rest takes at the mean speed so far; empty before the first update."""
+    """Estimates the time left from the mean speed so far; empty before the first update."""
     if not run.updates or run.planned is None:
         return ""
     rest = run.last("seconds") / run.updates * (run.planned - run.updates)
@@ -224,7 +224,7 @@ def sparkline(values: Iterable[float], low: float, high: float) -> str:
 
 
 def _some(values: Sequence[float] | Column) -> Sequence[float] | Column:
-    """Returns the values, or as many of them, evenly spaced, as a curve has characters."""
+    """Returns at most as many values, evenly spaced, as a curve has characters."""
     if len(values) <= WIDTH:
         return values
     return np.asarray(values)[np.linspace(0, len(values) - 1, WIDTH).round().astype(int)]

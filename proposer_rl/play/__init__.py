@@ -1,1 +1,1 @@
-"""A local page on which levels are drawn and a run's Solvers are watched on them."""
+"""Serves a local page to draw levels and to watch a run's Solvers on them."""

@@ -1,4 +1,4 @@
-"""The page's server: what a browser on this machine may ask, and nothing else.
+"""Serves the page of the game to a browser on this machine, and to nobody else.
 
 Other pages in the same browser are strangers: they do not know the token in the address, may not
 read answers of another origin, and cannot pretend to be this host. Nothing is written, and no file
@@ -47,7 +47,7 @@ HEADERS = {
 
 
 def application(session: Session, token: str) -> Starlette:
-    """Returns the application: the page, and what it asks for, all below ``/TOKEN/``."""
+    """Returns the application, which serves the page and its questions below ``/TOKEN/``."""
     asked: dict[str, tuple[Any, Callable[[Any], Any]]] = {
         "examine": (Examine, session.examine),
         "levels": (Source, session.levels),
@@ -73,7 +73,7 @@ def application(session: Session, token: str) -> Starlette:
 
 
 class Guard:
-    """Lets through what comes from this server's own page, and says how browsers treat answers."""
+    """Refuses requests that are not from this server's own page, and adds headers to answers."""
 
     def __init__(self, app: ASGIApp, token: str) -> None:
         self._app, self._token = app, token.encode()
@@ -146,7 +146,7 @@ async def _answered(kind: Any, function: Callable[[Any], Any], request: Request)
 
 
 async def _result(function: Callable[[], Any]) -> Response:
-    """Returns what a function returns, as JSON; or the line of its error."""
+    """Returns a function's result as JSON, or its error in one line."""
     try:
         return JSONResponse(await run_in_threadpool(function))
     except (ValueError, LookupError, OSError) as error:

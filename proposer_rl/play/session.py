@@ -1,4 +1,4 @@
-"""One run as the page shows it, and what it may ask for."""
+"""Answers the page's questions on one run."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ class Session:
         return self._load(file, file.stat().st_mtime_ns)
 
     def _drawn(self, question: Drawn) -> dict[str, Any]:
-        """Draws of a distribution, what the Solver does there, and the episode that it played."""
+        """Returns levels drawn from a distribution, with results and an episode on each."""
         updates, learner = self._learner(question)
         copies, batch = learner.env.batch_size
         streams = Streams(question.seed, "play", question.name)

@@ -1,1 +1,1 @@
-"""From run folders to statistics, tables, figures and a page."""
+"""Compares runs: statistics, tables, figures, a page, and studies to publish."""

@@ -1,4 +1,4 @@
-"""Methods over several tasks: on each against the better of the baselines, worst case first."""
+"""Compares methods over several tasks, on each with the better of the baselines."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ COLUMNS = 4  # of the figure
 
 @dataclass(frozen=True)
 class Arena:
-    """Tasks that have all baselines, and the methods on them.
+    """The tasks that have all baselines, and the methods on them.
 
     Attributes:
         tasks: by their names, in the order of these.
@@ -56,7 +56,7 @@ class Arena:
 
     @cached_property
     def better(self) -> dict[str, str]:
-        """The baseline of the highest mean on every task."""
+        """The baseline with the highest mean on each task."""
         return {
             task: max(self.baselines, key=lambda label: _mean(study, label))
             for task, study in self.tasks.items()
@@ -82,7 +82,7 @@ class Arena:
 
     @cached_property
     def leads(self) -> dict[str, tuple[Estimate, float]]:
-        """The first method's lead over each other one in the mean, with Holm's p-value."""
+        """The first method's mean lead over each other one, with its corrected p-value."""
         first, *others = self.found
         means = [statistics.mean_of_estimates(self._common(first, other)) for other in others]
         corrected = statistics.holm([mean.p for mean in means])
@@ -94,7 +94,7 @@ class Arena:
 
     @cached_property
     def rows(self) -> list[Row]:
-        """Every method beside the first baseline, in the mean over tasks; the best first.
+        """Every method against the first baseline in the mean over tasks, the best first.
 
         Methods that lack a task come after those that have all.
         """
@@ -146,7 +146,7 @@ class Arena:
 
 
 def arena(studies: Sequence[Study], baselines: Sequence[str] = ()) -> Arena | None:
-    """Returns the tasks that have all baselines and measure a rate; None for fewer than two.
+    """Returns the tasks that have all baselines and measure a rate; None if fewer than two do.
 
     Args:
         studies: each a task.
@@ -166,14 +166,11 @@ def arena(studies: Sequence[Study], baselines: Sequence[str] = ()) -> Arena | No
 
 
 def summary(arena: Arena) -> Table:
-    """Returns a row for each method: worst case over tasks, mean, and the first method's lead."""
+    """Returns a table of each method's worst case and mean over tasks, and the first one's lead."""
     first, *_ = arena.found
     rows: list[dict[str, Cell]] = []
     every = len(arena.tasks)
     for label, found in arena.found.items():
-        ends = {task: one.interval().low for task, one in found.items()}
-        known = not any(map(math.isnan, ends.values()))
-        lowest = min(ends, key=ends.__getitem__) if known else None
         lead, p = arena.leads.get(label, (None, None))
         rows.append(
             {
@@ -181,43 +178,41 @@ def summary(arena: Arena) -> Table:
                 "tasks": every if len(found) == every else f"{len(found)} of {every}",
                 "worst case": _worst(found).interval(),
                 "its task": _worst_task(found),
-                "lowest end": None if lowest is None else ends[lowest],
-                "the end's task": lowest,
                 "mean over tasks": statistics.mean_of_estimates([*found.values()]).interval(),
                 f"{first} minus it, mean over tasks": lead and lead.interval(),
                 "p (Holm)": p,
             }
         )
     note = (
-        f"Differences to {arena.reference} in the mean of the headline along training; the better "
-        "one is that of the higher mean on the task, so that differences are rather too low than "
-        "too high. Worst case: the lowest over tasks, with its 95 % interval. Mean: all tasks "
-        "count alike and are taken as they are, so that its 95 % interval is over seeds: squared "
-        "errors of the tasks add up, with Satterthwaite's degrees of freedom. p: of the mean "
-        "difference between the first method and each other, on the "
-        "tasks that both have, in pairs of runs where seeds agree; by Student's t with the same "
-        "errors, two-sided, corrected for the number of methods (Holm). Intervals are not "
-        "corrected. Methods that lack a task come last."
+        f"Differences are to {arena.reference} in the mean of the headline along training; the "
+        "better baseline is chosen on each task by its mean, which makes differences too low "
+        "rather than too high. The worst case is the lowest difference over tasks, with its 95 % "
+        "interval. In the mean all tasks count alike and are taken as given, so its 95 % interval "
+        "is over seeds: the squared errors of the tasks add up, with Satterthwaite's degrees of "
+        "freedom. p tests the mean difference between the first method and each other one, on the "
+        "tasks that both have and in pairs of runs where seeds agree, by a two-sided t test with "
+        "the same errors, corrected for the number of methods (Holm). Intervals are not corrected. "
+        "Methods that lack a task come last."
     )
-    aside = ["lowest end", "the end's task"]
-    return Table("arena", f"Worst case and mean over {every} tasks", note, rows, aside)
+    return Table("arena", f"Worst case and mean over {every} tasks", note, rows)
 
 
 def about_rows(arena: Arena) -> str:
-    """Returns what must be known to read the first table."""
+    """Explains the columns of the first table."""
     count = sum(row.asked for row in arena.rows)
     return (
-        "Difference: of the means along training over seeds, method minus "
-        f"{arena.baselines[0]}, in the mean over tasks, which count alike, with a 95 % interval, "
-        "not corrected; by it methods are in order. p: corrected for all comparisons with the "
-        f"baseline, {count} (Holm). Worst task: its difference to {arena.reference}. Reached: on "
-        "how many tasks most runs get to the threshold. ×: times what the baseline spent, the "
-        "curriculum's frames included, geometric means over tasks."
+        "The difference is the method's mean along training minus that of "
+        f"{arena.baselines[0]}, averaged over seeds and then over tasks, which count alike, with "
+        "an uncorrected 95 % interval; methods are sorted by it. p is corrected for the number of "
+        f"comparisons with the baseline, {count} (Holm). The worst task is the one with the lowest "
+        f"difference to {arena.reference}. Reached is the number of tasks on which most runs reach "
+        "the threshold. × is a multiple of what the baseline spent, including frames of the "
+        "curriculum, as a geometric mean over tasks."
     )
 
 
 def task_table(arena: Arena) -> Table:
-    """Returns a row for each method and task: its differences to the baselines."""
+    """Returns a table of the differences to the baselines by method and task."""
     rows: list[dict[str, Cell]] = []
     for label, found in arena.found.items():
         for task, to_better in found.items():
@@ -235,15 +230,15 @@ def task_table(arena: Arena) -> Table:
                 row |= {"minus the better": to_better.interval(), "the better": arena.better[task]}
             rows.append(row)
     note = (
-        "Differences of means over seeds with 95 % intervals, not corrected: Student's over pairs "
-        f"of runs where both have the same seeds, else Welch's; with fewer than {FEWEST} seeds "
-        "none."
+        "Differences of means over seeds with uncorrected 95 % intervals: Student's over pairs of "
+        "runs where both have the same seeds, else Welch's; there is none with fewer than "
+        f"{FEWEST} seeds."
     )
     return Table("arena_tasks", "Task by task", note, rows)
 
 
 def answer(arena: Arena) -> list[str]:
-    """Returns how the best method compares to the baseline, and which has the best worst case."""
+    """Summarises how the best method compares to the baseline, and which is best at worst."""
     lead = next((row.sentence for row in arena.rows if row.asked), "")
     first, found = next(iter(arena.found.items()))
     worst = write(_worst(found).interval())
@@ -260,7 +255,7 @@ def answer(arena: Arena) -> list[str]:
 
 
 def differences(arena: Arena) -> Drawing:
-    """Returns a figure of each method's difference to the better baseline on every task."""
+    """Draws each method's difference to the better baseline on every task."""
     count = len(arena.found)
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
@@ -314,7 +309,7 @@ def _worst(found: Mapping[str, Estimate]) -> Estimate:
 
 
 def _names(studies: Sequence[Study]) -> list[str]:
-    """Returns unique names of tasks: as on the command lines, or else the studies' titles."""
+    """Returns unique names of tasks, from the command lines or else the studies' titles."""
     names, seen = [], Counter[str]()
     for study in studies:
         words = study.example.facts.get("overrides") or []

@@ -1,4 +1,4 @@
-"""From folders of runs to a folder with the evidence: page, figures, tables."""
+"""Writes a report on runs: a page, figures and tables."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
 # These are no charts, so that the page has them as pictures.
 STILL = {figures.side_by_side, figures.recorded_by_curricula}
 
-# What is to be said of means over the worst share of the levels, by whether they are exact.
+# A caveat on means over the worst share of the levels, by whether measurements are exact.
 SELECTION = {
-    True: "The measurements are exact, so that no second evaluation is needed: to sort the levels "
-    "by what is averaged selects no luck.",
-    False: "The measurements are sampled, and the levels are sorted by what is averaged: selection "
-    "bias makes the means too low, the more the smaller the share.",
+    True: "Measurements are exact, so sorting the levels by them adds no bias, and no second "
+    "evaluation is needed.",
+    False: "Measurements are sampled and the levels are sorted by them, so selection bias makes "
+    "these means too low, the more the smaller the share.",
     None: "The runs do not say whether their measurements are exact. If they are sampled, "
-    "selection bias makes the means too low, the more the smaller the share.",
+    "selection bias makes these means too low, the more the smaller the share.",
 }
 
 
@@ -56,7 +56,7 @@ def read_checked(
     baselines: Sequence[str],
     compare: Sequence[str] = (),
 ) -> tuple[list[Study], list[str]]:
-    """Returns the studies of the runs in some folders and notes; see :func:`write_report`."""
+    """Reads runs into studies, with notes on what was left out, and checks what was asked for."""
     first, found = next(iter(baselines), None), find_runs(folders)
     studies, notes = read_studies(found, threshold, first, compare)
     every = dict.fromkeys(path for folder in folders for path in begun(folder))
@@ -146,12 +146,12 @@ def write_report(
 
 
 def check_output(output: Path, *signs: str) -> None:
-    """Refuses an output folder that holds files which no report has written."""
+    """Refuses an output folder that has files in it but none of a former output."""
     occupied = output.exists() and any(output.iterdir())
     if occupied and not any((output / sign).is_file() for sign in signs):
         raise OutputError(
-            f"{output}: has files in it but no {' or '.join(signs)}; give a new folder or one that "
-            "was written before"
+            f"{output}: is not empty, and has no {' or '.join(signs)}; use a new directory, or one "
+            "that this command has written"
         )
 
 

@@ -1,4 +1,4 @@
-"""The page's charts and its slider as JSON: the numbers of the figures, with every single run."""
+"""Prepares the numbers of the page's charts and its slider as JSON."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MOST_BYTES = 2**20  # of all pictures of a study
 
 
 def charts(study: Study) -> dict[str, Json]:
-    """Returns everything that the page draws of a study, ready for JSON.
+    """Returns the numbers of all charts of a study, ready for JSON.
 
     Returns:
         ``methods``: each with its seeds. ``axes``: what can be on the abscissa.
@@ -127,7 +127,7 @@ def _mean(study: Study, group: Group, outcome: Outcome) -> Sequence[float]:
 
 
 def _stages(study: Study) -> dict[str, Json] | None:
-    """Returns what the page's slider shows: one run of each method, the first with recorded levels.
+    """Returns the stages of the slider for one run of each method, the first with recorded levels.
 
     If none of a method's runs has any, it is the first that recorded proposals.
 

@@ -1,4 +1,4 @@
-"""Compares methods, and decides which of two is better."""
+"""Compares methods and decides which of two is better."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Decision(NamedTuple):
     leader: str | None = None
 
     def told(self, label: str) -> str:
-        """Returns the decision in the words of one of the two methods, with its p.
+        """Returns the decision for one of the two methods in words, with its p.
 
         An interval is of one comparison: where it excludes zero and the corrected test decides
         nothing, both p are told.
@@ -89,7 +89,7 @@ class Decision(NamedTuple):
         return f"{kind}, p {p_text(self.p)}"
 
     def kind(self, label: str) -> str:
-        """Returns in a word what a method is, where the test decides."""
+        """Returns whether a method is better or worse, given that the test decides."""
         if self.leader is None:
             return NOT_LEARNT
         return "better" if self.leader == label else "worse"
@@ -112,7 +112,7 @@ def primary(study: Study) -> Outcome:
 
 
 def waiting_outcome(study: Study) -> Outcome:
-    """Returns the outcome "updates until the headline reaches a threshold", cut at the horizon."""
+    """Returns the outcome "updates to the threshold", cut off at the horizon."""
     name, threshold, horizon = study.headline, study.threshold, study.horizon
     return Outcome(
         f"updates to {level_text(name, threshold)} {words(name)} (at most {horizon})",
@@ -122,13 +122,13 @@ def waiting_outcome(study: Study) -> Outcome:
 
 
 def at_the_end(study: Study, name: str) -> Outcome:
-    """Returns the outcome "a measurement at the horizon"."""
+    """Returns the outcome "measurement at the horizon"."""
     value = partial(Run.at, measurement=name, updates=study.horizon)
     return Outcome(f"{words(name)} after {study.horizon} updates", value)
 
 
 def outcomes(study: Study) -> list[Outcome]:
-    """Returns the primary outcome, then the secondary ones, on which nothing is decided."""
+    """Returns the primary outcome, which decides, and then the secondary ones."""
     ends = [at_the_end(study, name) for name in study.measurements]
     return [primary(study), waiting_outcome(study), *ends]
 
@@ -143,13 +143,13 @@ def difference(outcome: Outcome, one: Group, other: Group) -> Estimate:
 
 
 def difference_between(one: Mapping[int, float], other: Mapping[int, float]) -> Estimate:
-    """Returns how two groups differ, from the values of their runs by seed."""
+    """Returns the difference of two groups' means, given the values of their runs by seed."""
     paired = list(one) == list(other)
     return statistics.difference_of([*one.values()], [*other.values()], paired)
 
 
 def learnt(group: Group, name: str, updates: float) -> bool:
-    """Returns whether a measurement has grown significantly, a rate by more than :data:`ALIKE`."""
+    """Returns whether a measurement grew significantly, and a rate by more than :data:`ALIKE`."""
     gains = np.array([run.at(name, updates) - run.metrics[name].iloc[0] for run in group.runs])
     known = gains[~np.isnan(gains)]
     if len(known) < statistics.FEWEST:
@@ -173,7 +173,7 @@ def decisions(study: Study, outcome: Outcome | None = None) -> dict[tuple[str, s
 
 
 def against_baseline(study: Study) -> dict[str, Decision]:
-    """Decides by the primary outcome which methods are better or worse than the baseline.
+    """Decides which methods are better or worse than the baseline by the primary outcome.
 
     Only these tests are corrected together: it is they that were asked for.
     """

@@ -1,4 +1,4 @@
-"""Figures: curves over training and bars, levels, and heat maps of proposals."""
+"""Draws the still figures: curves, bars, levels, and heat maps of proposals."""
 
 from __future__ import annotations
 
@@ -52,11 +52,10 @@ def learning_curves(study: Study) -> Drawing:
     return Drawing(
         "learning_curves",
         "The Solver during training, and updates needed (the paper's Figure 2)",
-        f"Lines: median over seeds. Bands: {HELD:.0%} interval of the median, from {FEWEST} "
-        "seeds on; with fewer every seed has a thin line of its own. Thin, too: not all "
-        "runs of the method are that long. Bars: median number of "
-        "updates, cut at the horizon, with the same interval; dots are runs, triangles censored "
-        "runs, which never got there.",
+        "Lines are medians over seeds, thin where not all runs of the method are that long. Bands "
+        f"are {HELD:.0%} intervals of the median; with fewer than {FEWEST} seeds every seed has a "
+        "thin line instead. Bars are median numbers of updates, cut off at the horizon, with the "
+        "same interval; dots are runs, and triangles are censored runs, which never got there.",
         [*panels, partial(_draw_bars, study=study)],
         3,
         study.legend,
@@ -64,21 +63,21 @@ def learning_curves(study: Study) -> Drawing:
 
 
 def cost_curves(study: Study) -> Drawing:
-    """Draws the headline against updates and every cost, the curriculum's part included."""
+    """Draws the headline against updates and against costs, including those of the curriculum."""
     measure = measures.measured(study)[study.headline]
     seconds = (
-        "Seconds: of the whole process, evaluation included; where seeds were trained together, "
-        "an even share. Seconds can be compared only between runs on equal machines."
+        "Seconds are of the whole process, including evaluation, or an even share where seeds were "
+        "trained together. Compare them only between runs on equal machines."
     )
     if study.timed:
         seconds = (
-            "Seconds: updates times what one of the method takes, all methods timed in turns on "
-            f"one machine ({study.timed}), without measuring the Solver."
+            "Seconds are updates times the seconds of one, with all methods timed in turns on one "
+            f"machine ({study.timed}) and without evaluations."
         )
     return Drawing(
         "cost",
         f"The same {words(study.headline)} against updates and against its whole cost",
-        "Frames: the Solver's own plus those that the curriculum spent, on replicas or on scoring. "
+        "Frames are the Solver's own and those that the curriculum spent on replicas or scoring. "
         + seconds,
         [partial(_draw_curves, study=study, measure=measure, axis=axis) for axis in measure.axes],
         3,
@@ -95,8 +94,8 @@ def difficulty(study: Study) -> Drawing | None:
     return Drawing(
         "difficulty",
         "What the Solver trained on",
-        "Statistics of the task over the batch of each evaluated update: means, or where a name "
-        "says so standard deviations (sd). Lines and bands as above.",
+        "Statistics of the batch at each evaluated update: means, or standard deviations where the "
+        "name says sd. Lines and bands are as above.",
         [partial(_draw_curves, study=study, measure=measure) for measure in every],
         3,
         {group.label: group.look for group in shown},
@@ -104,7 +103,7 @@ def difficulty(study: Study) -> Drawing | None:
 
 
 def draw_series(axes: Axes, series: Series, look: Look) -> np.ndarray:
-    """Draws the median and interval of runs, and every run where they are too few for one.
+    """Draws the median of runs with its interval, or every run where they are too few for one.
 
     Returns:
         The median, float [n].
@@ -177,7 +176,7 @@ def along_training(study: Study) -> Drawing | None:
 
 
 def side_by_side(study: Study) -> Drawing | None:
-    """Draws levels measured on beside early and late proposals (the paper's Figure 5)."""
+    """Draws evaluation levels, and early and late proposals (the paper's Figure 5)."""
     task = study.example.task
     rows = [(words(name), task.samples.get(name, [])) for name in task.distributions]
     for group in study.groups:
@@ -187,14 +186,14 @@ def side_by_side(study: Study) -> Drawing | None:
     return _in_rows(
         rows,
         "samples",
-        "Samples: what is measured on, and proposals (the paper's Figure 5)",
+        "Evaluation levels and proposals (the paper's Figure 5)",
         f"Random {task.levels} of the distributions, and those that the Proposers made at their "
         f"first and last evaluated update. {task.key}",
     )
 
 
 def recorded_by_curricula(study: Study) -> Drawing | None:
-    """Draws the levels that curricula recorded last, of each method's first seed."""
+    """Draws the levels that the curriculum of each method's first seed recorded last."""
     task = study.example.task
     rows = [
         (f"{group.label}: {caption}", levels)
@@ -205,7 +204,7 @@ def recorded_by_curricula(study: Study) -> Drawing | None:
         rows,
         "recorded",
         f"{task.levels.capitalize()} that the curricula recorded",
-        "As each curriculum recorded them last, in its first seed: what is in its buffer, say. "
+        "The last record of each curriculum's first seed, such as the levels in its buffer. "
         f"{task.key}",
     )
 
@@ -213,7 +212,7 @@ def recorded_by_curricula(study: Study) -> Drawing | None:
 def _in_rows(
     rows: Sequence[tuple[str, Sequence[LevelRecord]]], name: str, title: str, caption: str
 ) -> Drawing | None:
-    """Returns a figure with a row of pictures for each title that has any; None without one."""
+    """Draws a row of pictures for each title that has any; None without one."""
     panels = [
         partial(_draw_row, levels=levels, title=head)
         for head, levels in rows
@@ -224,7 +223,7 @@ def _in_rows(
 
 
 def draw_run(folder: Path, title: str) -> Path:
-    """Draws ``run.png`` in a run's folder, measurements and levels trained on; returns its path."""
+    """Draws the measurements and training levels of a run to ``run.png``, and returns its path."""
     runs = read_run(folder)
     height = (SIDE + 0.15) * BATCH + 0.4
     with rc_context(SETTINGS):
@@ -253,7 +252,7 @@ def _draw_measurements(axes: Axes, runs: Sequence[Run]) -> None:
 
 
 def _draw_stages(figure: FigureBase, samples: Sequence[SampleRecord], title: str) -> None:
-    """Stages from left to right, the levels of a batch from top to bottom."""
+    """Draws stages from left to right, and levels of a batch from top to bottom."""
     last = len(samples) - 1
     stages = [samples[i] for i in sorted({round(i * last / (STAGES - 1)) for i in range(STAGES)})]
     grid = figure.subplots(BATCH, STAGES, squeeze=False)
@@ -279,16 +278,16 @@ def _show(places: Sequence[Axes], levels: Sequence[LevelRecord]) -> None:
 
 
 def heat_maps(study: Study) -> Drawing | None:
-    """Draws where in the space of levels the proposals lie, along training; None without any."""
+    """Draws the distribution of proposals in the space of levels along training, if recorded."""
     found = [(group, maps) for group in study.groups if (maps := _histograms(group)) is not None]
     if not found:
         return None
     return Drawing(
         "proposals",
         f"Proposals over {' and '.join(list(found[0][0].runs[0].task.space)[:2])}, along training",
-        "Share of a cycle's proposals, averaged over the seeds. White is the share "
-        "under domain randomization, orange is more, purple less: a map that stays "
-        "white is a Proposer that has not learnt, or seeds that went different ways.",
+        "Shares of a cycle's proposals, averaged over the seeds. White is the share under domain "
+        "randomization; orange is more, purple is less. A map that stays white shows a curriculum "
+        "that has not learnt, or seeds that went different ways.",
         [
             partial(_draw_strip, group=group, updates=updates, shares=shares)
             for group, (updates, shares) in found
@@ -310,7 +309,7 @@ def _draw_strip(figure: FigureBase, group: Group, updates: Column, shares: Colum
 def _draw_maps(
     figure: FigureBase, row: Sequence[Axes], shares: Sequence[Column], run: Run, largest: float
 ) -> None:
-    """Maps side by side with one bar of colours: white is even, orange more, purple less."""
+    """Draws maps side by side with one colour bar: white is even, orange more, purple less."""
     even = 1 / shares[0].size
     largest = max(largest, 2 * even)
     *above, (across, columns) = list(run.task.space.items())[:2]
@@ -331,7 +330,7 @@ def _draw_maps(
 
 
 def _ticks(values: Sequence[float | str]) -> tuple[Column, list[str]]:
-    """Places and texts of an axis' values, or of some of them where they are many."""
+    """Returns places and texts for an axis's values, or for some where they are many."""
     step = -(-len(values) // MOST_TICKS)
     texts = [value if isinstance(value, str) else f"{value:g}" for value in values[::step]]
     return np.arange(0.5, len(values), step), texts

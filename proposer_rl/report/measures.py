@@ -1,4 +1,4 @@
-"""The curves of a study, for the figures and for the page."""
+"""Computes the curves of a study, for the figures and for the page."""
 
 from __future__ import annotations
 
@@ -72,13 +72,13 @@ class Measure(NamedTuple):
 
 
 def every(study: Study) -> list[Measure]:
-    """Returns all measures that can be drawn of a study."""
+    """Returns all measures of a study that can be drawn."""
     solver, curricula = [*measured(study).values(), *trained(study)], gains(study)
     return [*solver, *curricula, *own_numbers(study), *worst(study)]
 
 
 def measured(study: Study) -> dict[str, Measure]:
-    """Returns measures of the Solver against updates and every cost, by the table's column."""
+    """Returns the Solver's measurements against updates and costs, by column of the table."""
     known = dict.fromkeys(name for run in study.runs for name in run.metrics if name not in COST)
     first = [*study.measurements, *(f"{name}_worst10" for name in study.measurements)]
     return {
@@ -96,7 +96,7 @@ def measured(study: Study) -> dict[str, Measure]:
 
 
 def trained(study: Study) -> list[Measure]:
-    """Returns measures of the levels trained on, the task's own statistics."""
+    """Returns the task's statistics of the levels trained on."""
     names = dict.fromkeys(name for run in study.runs for name in run.statistics)
     return [
         Measure(
@@ -141,7 +141,7 @@ def own_numbers(study: Study) -> list[Measure]:
 
 
 def worst(study: Study) -> list[Measure]:
-    """Returns means over the worst levels at the end against their share (CVaR)."""
+    """Returns the means over the worst levels at the end, against their share (CVaR)."""
     levels = study.example.task.levels
     return [
         Measure(

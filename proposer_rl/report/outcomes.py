@@ -1,4 +1,4 @@
-"""The results: tables of groups, pairs and runs, and the sentences that a reader needs."""
+"""Tables of methods, pairs and runs, and the sentences that summarise them."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from proposer_rl.report.tables import Cell, Table, write
 from proposer_rl.runs.records import level_text, words
 
 MILLION = 1e6
-# What methods and ablations do, by ``method`` or ``ablation`` and name.
+# Descriptions of methods and ablations, by ``method`` or ``ablation`` and name.
 Meanings = Mapping[str, Mapping[str, str]]
 LISTED = 6  # methods that a sentence names
 
@@ -67,18 +67,18 @@ def comparison_table(study: Study) -> Table:
             )
     note = (
         f"Only the primary outcome, {primary(study).name}, has verdicts; their p-values are "
-        "corrected together for the number of pairs (Holm). Difference of means: first minus "
-        "second, with a 95 % interval, not corrected: Student's over pairs of runs where both have "
-        "the same seeds, else Welch's. Seeds needed: per method, about, for a power of "
-        "80 % if the true difference is the one seen. With fewer than "
-        f"{FEWEST} seeds no interval and no verdict."
+        "corrected for the number of pairs (Holm). The difference is the mean of the first method "
+        "minus that of the second, with an uncorrected 95 % interval: Student's over pairs of runs "
+        "where both have the same seeds, else Welch's. Seeds needed is about how many each method "
+        "needs for a power of 80 %, if the true difference is the one seen. With fewer than "
+        f"{FEWEST} seeds there is no interval and no verdict."
     )
     aside = ["verdict", "p (Holm)", "P(first better)"]
     return Table("comparisons", "Pairwise comparisons", note, rows, aside)
 
 
 class Row(NamedTuple):
-    """A method beside the baseline, as the first table of a report shows it.
+    """A method against the baseline, as in the first table of a report.
 
     Attributes:
         label: of the method.
@@ -109,12 +109,12 @@ class Row(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """The row in words."""
+        """The row as a sentence."""
         return f"{self.says}, {self.verdict}." if self.asked else f"{self.says}."
 
 
 def first_rows(study: Study) -> list[Row]:
-    """Returns all methods beside the baseline, the highest mean over seeds first."""
+    """Returns all methods against the baseline, the highest mean over seeds first."""
     outcome, baseline = primary(study), study.baseline
     every = against_baseline(replace(study, planned=(), chosen=baseline.label))
     found = every | against_baseline(study)
@@ -139,7 +139,7 @@ def first_rows(study: Study) -> list[Row]:
 
 
 def factors(group: Group, baseline: Group) -> tuple[float, float]:
-    """Returns how many times the frames and the seconds of the baseline a method took."""
+    """Returns a method's frames and seconds as multiples of the baseline's."""
     found = []
     for spent in (lambda run: run.total_frames[-1], lambda run: run.own_seconds[-1]):
         own, other = (np.mean([*map(spent, each.runs)]) for each in (group, baseline))
@@ -153,7 +153,7 @@ def signed(difference: Interval) -> str:
 
 
 def cost(frames: float, seconds: float) -> str:
-    """Returns in words what a method costs beside the baseline."""
+    """Returns a method's cost in words, as multiples of the baseline's."""
     return f"{times(frames)}× the frames and {times(seconds)}× the seconds"
 
 
@@ -190,7 +190,7 @@ def _reaching(study: Study, group: Group) -> str:
 def first_table(
     rows: Sequence[Row], baseline: str, shown: str, note: str, name: str = "baseline"
 ) -> Table:
-    """Returns the rows as a table; ``shown`` is the title of what is reached."""
+    """Returns the rows as a table, whose column on the threshold is titled ``shown``."""
     cells: list[dict[str, Cell]] = [
         {
             "method": row.label if row.decision else f"{row.label} (baseline)",
@@ -209,13 +209,14 @@ def first_table(
 
 
 def about_rows(study: Study) -> str:
-    """Returns what must be known to read the first table."""
+    """Explains the columns of the first table."""
     return (
-        f"Difference: of the means over seeds of {primary(study).name}, method minus "
-        f"{study.baseline.label}, with a 95 % interval, not corrected; by it methods are in order. "
-        f"p: corrected for all comparisons with the baseline, {len(study.asked) - 1} (Holm). "
-        "Updates: the median over seeds, with how many runs got there if not all did. ×: times "
-        "what the baseline spent, the curriculum's frames included."
+        f"The difference is the method's mean over seeds of {primary(study).name} minus that of "
+        f"{study.baseline.label}, with an uncorrected 95 % interval; methods are sorted by it. p "
+        f"is corrected for the number of comparisons with the baseline, {len(study.asked) - 1} "
+        "(Holm). Updates are the median over seeds, with the number of runs that reached the "
+        "threshold if not all did. × is a multiple of what the baseline spent, including frames of "
+        "the curriculum."
     )
 
 
@@ -255,9 +256,10 @@ def group_table(study: Study) -> Table:
         }
         rows.append(row)
     note = (
-        f"Updates: min(updates, {horizon}) of the runs of full length; measured every "
-        "few updates, so never exact. Frames: the Solver's own, and with all that the curriculum "
-        f"spent. Evaluations: of levels, asked for by the curriculum. {INTERVALS}"
+        f"Updates to the threshold are of runs of full length and cut off at {horizon}; they are "
+        "as exact as measurements are frequent. Frames are the Solver's own, then with those that "
+        "the curriculum spent. Evaluations are those of levels that the curriculum asked for. "
+        f"{INTERVALS}"
     )
     return Table("methods", "Methods", note, rows, [tenth, f"P(better than {baseline.label})"])
 
@@ -287,11 +289,11 @@ def run_table(study: Study) -> Table:
                     "seconds": float(run.own_seconds[-1]),
                 }
             )
-    return Table("runs", "Runs", "Measurements are the run's last.", rows)
+    return Table("runs", "Runs", "Measurements are the last of each run.", rows)
 
 
 def answer(study: Study) -> list[str]:
-    """Returns what a reader needs first: a method beside the baseline, and where the rest stands.
+    """Summarises a study in two or three sentences: one method against the baseline, then the rest.
 
     The method is the first planned one, or the one with the highest mean.
     """
@@ -322,7 +324,7 @@ def answer(study: Study) -> list[str]:
 
 
 def meaning(group: Group, meanings: Meanings) -> str:
-    """Returns what a method does, in a line: as its runs recorded it, or else as given."""
+    """Describes a method in a line, as its runs recorded it or else as given."""
     run = group.runs[0]
     about = run.facts.get("about", {})
     said = [

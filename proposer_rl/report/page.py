@@ -1,4 +1,4 @@
-"""The page and the same in short: one study is one section, and the page holds all it shows."""
+"""Renders the page in HTML and its short form in Markdown, with a section for each study."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ Section = dict[str, Any]  # all that the page shows of a study, as the template 
 
 
 def render(**content: Any) -> str:
-    """Returns the page as HTML; whatever comes from a run is escaped or packed."""
+    """Renders the page as HTML; text from runs is escaped or packed."""
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
@@ -65,7 +65,7 @@ def render(**content: Any) -> str:
 
 @cache
 def _library() -> tuple[str, str]:
-    """Returns the library of the charts, as it is and packed, which takes half a second."""
+    """Returns the library of the charts, plain and packed; packing takes half a second."""
     from plotly.offline import get_plotlyjs  # what only draws figures needs no charts
 
     library = get_plotlyjs()
@@ -73,12 +73,12 @@ def _library() -> tuple[str, str]:
 
 
 def pack(text: str) -> str:
-    """Returns a text as gzip in base64, which the page's script unpacks and no HTML can end."""
+    """Packs a text as gzip in base64, which cannot end the script element that holds it."""
     return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
 
 
 def figure(drawing: Drawing, png: bytes) -> Section:
-    """Returns what the page shows of a still figure."""
+    """Returns a still figure as the page embeds it."""
     with Image.open(io.BytesIO(png)) as image:
         width = round(image.width * PIXELS / DPI)
     content = base64.b64encode(in_few_colours(png)).decode()
@@ -91,14 +91,14 @@ def figure(drawing: Drawing, png: bytes) -> Section:
 
 
 def methods(study: Study, meanings: Meanings) -> list[tuple[str, str]]:
-    """Returns the methods and what they do."""
+    """Returns the methods with their descriptions."""
     return [(group.label, meaning(group, meanings)) for group in study.groups]
 
 
 def first(
     table: Table, rows: Sequence[Row], labels: Sequence[str], planned: Sequence[str]
 ) -> Section:
-    """Returns the first table of a page: each method beside the baseline, with its dot.
+    """Returns the first table of a page: each method against the baseline, with its dot.
 
     Args:
         table: of these rows.
@@ -145,7 +145,7 @@ def first(
 
 
 def _ticks(wanted: Sequence[tuple[float, str]]) -> list[tuple[float, str]]:
-    """Returns those numbers of a scale that fit beside the ones before, by their centres."""
+    """Returns the numbers of a scale, with their centres, leaving out those that would overlap."""
     found: list[tuple[float, str]] = []
     for place, text in wanted:
         half = DIGIT * len(text) / 2
@@ -168,7 +168,7 @@ def first_of_tasks(compared: arena.Arena) -> Table:
 
 
 def facts(study: Study) -> list[tuple[str, str]]:
-    """Returns what was compared, as labels and texts."""
+    """Returns facts on the comparison, as labels and texts."""
     threshold = level_text(study.headline, study.threshold)
     return [
         (
@@ -235,7 +235,7 @@ def configs(study: Study) -> list[tuple[str, str]]:
 
 
 def _digest(script: str) -> str:
-    """Returns the hash by which the page's Content-Security-Policy admits a script."""
+    """Returns the hash that lets a script run under the page's Content-Security-Policy."""
     return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
 
 
@@ -300,7 +300,7 @@ def _distinct(runs: Sequence[Run], text: Any) -> str:
 
 
 def section(study: Study, figures: str) -> str:
-    """Returns a study's part of a Markdown page: the answer, the tables, what was run."""
+    """Renders a study in Markdown: the answer, the tables, the runs."""
     about = facts(study) + origin(study)
     if short := incomplete(study):
         text = f"Not finished, or shorter than {study.horizon} updates"
@@ -321,7 +321,7 @@ def section(study: Study, figures: str) -> str:
 
 
 def over_tasks(compared: arena.Arena, figures: str) -> str:
-    """Returns the Markdown on several tasks: the answer, the tables and their figure."""
+    """Renders the comparison over several tasks in Markdown."""
     drawing = arena.differences(compared)
     summary, by_task = arena.summary(compared), arena.task_table(compared)
     picture = f"![{escape_markdown(drawing.title)}]({figures}{drawing.name}.png)"
@@ -331,7 +331,7 @@ def over_tasks(compared: arena.Arena, figures: str) -> str:
 
 
 def of_teachers(drawings: Sequence[Drawing], notes: Sequence[str], figures: str) -> str:
-    """Returns the Markdown on logs of teachers: notes and figures."""
+    """Renders the logs of teachers in Markdown."""
     pictures = [f"![{escape_markdown(one.title)}]({figures}{one.name}.png)" for one in drawings]
     return "\n\n".join(["## Logs of teachers", *map(escape_markdown, notes), *pictures])
 
@@ -346,7 +346,7 @@ def _tables(tables: Iterable[Table]) -> list[str]:
 
 
 def document(parts: Sequence[str], command: str, notes: Sequence[str]) -> str:
-    """Returns a Markdown page of these parts, the notes, and the command that writes it."""
+    """Joins parts, notes and the command that writes them into a Markdown page."""
     left_out = "\n".join(f"- {escape_markdown(note)}" for note in notes)
     made = f"The whole report is written by\n\n```bash\n{command}\n```"
     return "\n\n".join(filter(None, [*parts, left_out, made])) + "\n"

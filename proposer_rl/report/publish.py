@@ -1,4 +1,4 @@
-"""Finished runs as a study: a folder of a few tables, small enough for a repository.
+"""Writes finished runs as a study, a folder of a few tables, small enough for a repository.
 
 Checkpoints, pictures of levels and this machine's folders are left out, and fractions have six
 significant digits. A study is read as runs are.
@@ -78,7 +78,7 @@ def publish(
 
 
 def write_study(folder: Path, runs: Sequence[tuple[str, Run]]) -> None:
-    """Writes the tables of a study; those of a former one are replaced."""
+    """Writes the tables of a study in place of former ones."""
     listed = [
         {
             "run": name,
@@ -137,7 +137,7 @@ def _draw(drawing: Drawing, folder: Path, prefix: str) -> None:
 
 
 def _named(folders: Sequence[Path]) -> dict[str, list[Run]]:
-    """Returns the seeds of every run by its name: where it lies below the folder given."""
+    """Returns the seeds of every run by its name, its path below the folder given."""
     found: dict[str, list[Run]] = {}
     for folder in map(Path.resolve, folders):
         for path in find_runs([folder]):
@@ -148,7 +148,7 @@ def _named(folders: Sequence[Path]) -> dict[str, list[Run]]:
             for name, runs in own.items():
                 if name in found:
                     places = f"{found[name][0].folder}, {runs[0].folder}"
-                    raise OutputError(f"two runs are called {name}: {places}")
+                    raise OutputError(f"two runs have the name {name}: {places}")
                 found[name] = runs
     return found
 

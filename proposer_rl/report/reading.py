@@ -1,4 +1,4 @@
-"""Runs are read from their folders, or from a study's tables."""
+"""Reads runs from their folders, or from the tables of a study."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from proposer_rl.report.runs import COST, LARGEST_FILE, NAMES, STUDY, Run
+from proposer_rl.report.runs import COST, NAMES, STUDY, Run
 from proposer_rl.runs.folder import FAILURE, is_rate, read_csv, read_jsonl
 from proposer_rl.runs.records import (
     LARGEST,
@@ -37,13 +37,13 @@ class UnreadableRun(ValueError):
 
 
 class OutputError(ValueError):
-    """The report that was asked for cannot be written; the message is one line."""
+    """A report cannot be written as asked; the message is one line."""
 
     exit_code = 2
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:
-    """Returns the folders of runs and studies in some folders, each once, as people sort them."""
+    """Finds the folders of runs and studies in some folders, each once, in natural order."""
     found: list[Path] = []
     for folder in folders:
         inside = [
@@ -53,8 +53,8 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
         ]
         if not inside:
             raise UnreadableRun(
-                f"{folder}: no run in it: a run's folder has config.json and metrics.csv, as "
-                f"bin/train writes them, a study's {STUDY}"
+                f"{folder}: holds no runs; a run's folder has config.json and metrics.csv, and a "
+                f"study's {STUDY}"
             )
         found += inside
     each_once = {path.resolve(): path for path in found}.values()
@@ -62,7 +62,7 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
 
 
 def begun(folder: Path) -> list[Path]:
-    """Returns the folders of runs in a folder, or itself, without studies, also unmeasured ones."""
+    """Finds the folders of runs in a folder, or itself, including those without measurements."""
     return [path for path, files in _walk(folder) if STUDY not in files]
 
 
@@ -94,10 +94,7 @@ def read_run(folder: Path) -> list[Run]:
 
 
 def _read_folder(folder: Path) -> list[Run]:
-    pictures = folder / "curriculum.jsonl"
-    # Of many seeds and evaluations they are too many; all else of the run can be shown.
-    large = pictures.is_file() and pictures.stat().st_size > LARGEST_FILE
-    recorded = [] if large else _optional(pictures, read_jsonl)
+    recorded = _optional(folder / "curriculum.jsonl", read_jsonl)
     return _runs(
         folder,
         _read_json(folder / "config.json"),
@@ -157,7 +154,7 @@ def _by_run(folder: Path, name: str) -> dict[str, pd.DataFrame]:
 
 
 def _level_results(levels: pd.DataFrame) -> list[Record]:
-    """Returns a study's rows of single levels as a folder has them: a record for each seed."""
+    """Returns a study's results on single levels, with a record for each seed as in a folder."""
     if not len(levels):
         return []
     place = ["seed", "updates", "distribution"]
@@ -216,7 +213,7 @@ def _read_json(file: Path) -> dict[str, Any]:
 
 
 def _levels(rows: Sequence[Record], seed: int, updates: int) -> dict[str, Column]:
-    """Returns what a seed reached on every level after that many updates, [levels] by column."""
+    """Returns a seed's results on every level after that many updates, [levels] by column."""
     found = {}
     for row in rows:
         if (row["seed"], row["updates"]) == (seed, updates):
@@ -228,13 +225,13 @@ def _levels(rows: Sequence[Record], seed: int, updates: int) -> dict[str, Column
 
 
 def _last_sheets(cycles: Sequence[Record], sheets: Sequence[Any], seed: int) -> Any:
-    """Returns the pictures of the last cycle that has any and is not another seed's."""
+    """Returns the pictures of a seed's last cycle that has any."""
     own = [s for row, s in zip(cycles, sheets, strict=True) if s and row.get("seed", seed) == seed]
     return own[-1] if own else {}
 
 
 def _rounded(rate: bool | NDArray[np.bool_], values: Column) -> Column:
-    """Returns values [n]; those of a rate are moved into 0 to 1 where rounding put them outside."""
+    """Returns values [n], with rates that rounding put outside of 0 to 1 moved inside."""
     inside = values.clip(0, 1)
     return np.where(rate & (np.abs(values - inside) < ROUNDING), inside, values)
 
@@ -249,10 +246,10 @@ def _of_seed(table: pd.DataFrame, seed: int) -> pd.DataFrame:
 
 
 def _check_metrics(run: Run) -> None:
-    """Refuses what would make every comparison wrong in silence."""
+    """Refuses tables that would silently make every comparison wrong."""
     needed = {*COST, *run.measurements, run.headline}
     unknown = run.metrics.reindex(columns=sorted(needed)).isna().any()
     if unknown.any():
         raise ValueError(f"metrics.csv: {unknown.idxmax()} is not always a number")
     if (np.diff(run.metrics["updates"]) <= 0).any():
-        raise ValueError("metrics.csv: updates do not grow from row to row")
+        raise ValueError("metrics.csv: updates must increase from row to row")

@@ -1,10 +1,9 @@
-"""A run as a report sees it, one seed of a folder, and runs as a few tidy tables.
+"""A run as a report sees it, which is one seed of a folder; and the tidy tables of runs.
 
-The tables are of a report, and of a study, which is read as runs are. A study's folder has
-``runs.csv.xz``, a row for each run with its settings and facts as JSON, and the tables ``metrics``,
-``training``, ``cycles`` and ``levels``, each a row for what a run recorded at one moment, of one
-cycle or of one level. Cells of ``cycles`` are JSON, so that lists stay lists. Every number is
-written so that it reads back bit for bit.
+Reports and studies have the same tables. The folder of a study has ``runs.csv.xz``, with a row for
+each run whose settings and facts are JSON, and the tables ``metrics``, ``training``, ``cycles`` and
+``levels`` with a row for each evaluation, cycle or level. Cells of ``cycles`` are JSON, so that
+lists stay lists. Every number is written so that it reads back bit for bit.
 """
 
 from __future__ import annotations
@@ -38,7 +37,6 @@ OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_n
 _STUDENT = re.compile(r"lifetime_(\d{1,9})")
 STUDY = "runs.csv.xz"  # what makes a folder a study's
 NAMES = ("metrics", "training", "cycles", "levels")
-LARGEST_FILE = 64 * 2**20  # bytes of pictures that are read
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,7 @@ class Run:
 
     @property
     def headline(self) -> str:
-        """The measurement that runs are summed up by."""
+        """The measurement by which runs are compared."""
         return str(self.config["schedule"]["headline"])
 
     @property
@@ -115,7 +113,7 @@ class Run:
 
     @property
     def planned(self) -> int | None:
-        """Updates that the run shall have; None where the folder does not say."""
+        """The planned number of updates; None where the folder does not say."""
         value: int | None = self.facts.get("planned_updates", self.facts.get("updates"))
         return value
 
@@ -126,12 +124,12 @@ class Run:
 
     @cached_property
     def total_frames(self) -> Column:
-        """Environment frames at each evaluation, those that the curriculum spent included."""
+        """Environment frames at each evaluation, including those of the curriculum."""
         return self.columns["frames"] + self.columns["curriculum_frames"]
 
     @cached_property
     def own_seconds(self) -> Column:
-        """Wall seconds at each evaluation: an even share where seeds were trained together."""
+        """Wall seconds at each evaluation; an even share where seeds were trained together."""
         return self.columns["seconds"] / self.shared_by
 
     def last(self, name: str) -> float:
@@ -202,7 +200,7 @@ class Run:
 
     @property
     def whose_cycles(self) -> tuple[Path, Any]:
-        """What tells its cycles from another run's: its folder and, where they have one, a seed."""
+        """A key of its cycles: its folder and, where they have one, their seed."""
         return self.folder, self.cycles[0].get("seed") if self.cycles else None
 
     def shares(self, cycle: Record) -> Column | None:
@@ -223,7 +221,7 @@ def share_map(shares: Column) -> Column:
 
 
 def tables(runs: Iterable[tuple[str, Run]], key: str = "run") -> dict[str, pd.DataFrame]:
-    """Returns what runs recorded as tables, a row for each moment, cycle or level.
+    """Returns the records of runs as tables, with a row for each evaluation, cycle or level.
 
     Args:
         runs: each with the name that its rows carry.

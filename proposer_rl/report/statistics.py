@@ -1,7 +1,7 @@
-"""Medians, differences and shares over few runs, with intervals that hold for five of them.
+"""Computes medians, differences and shares over few runs, with intervals that hold for five.
 
-Nothing here knows what a run is. How often the intervals cover, and how often equal laws differ
-significantly, is measured in ``tests/report/test_coverage.py`` and by ``bin/research intervals``.
+Nothing here knows what a run is. ``tests/report/test_coverage.py`` and ``bin/research intervals``
+measure how often the intervals cover, and how often equal distributions differ significantly.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ MOST_SEEDS = 1_000_000  # more say that there is no difference to be found
 FEWEST = 5  # runs for an interval
 POWER = 0.8
 
-# What is said of numbers of a method, for a reader.
+# Explains a method's numbers to a reader.
 INTERVALS = (
-    "Numbers are medians over seeds, costs means. Brackets hold the median of such runs with a "
-    f"probability of at least {HELD:.0%}, whatever the law; from {FEWEST} seeds on; not corrected."
+    "Numbers are medians over seeds, and costs are means. Brackets contain the median of such runs "
+    f"with a probability of at least {HELD:.0%}, for any distribution; they need {FEWEST} seeds, "
+    "and are not corrected for the number of methods."
 )
 
 Values = Sequence[float] | NDArray[np.float64]
@@ -40,7 +41,7 @@ class Interval(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """A mean, or a difference of means, that Student's distribution holds for.
+    """A mean, or a difference of means, with its error by Student's distribution.
 
     Attributes:
         value: the estimate.
@@ -67,8 +68,8 @@ def mean_of(values: Values) -> Estimate:
     """Returns the mean of independent values, with its standard error and degrees of freedom.
 
     The degrees of freedom are n minus the number of runs that share the most common value: n - 1
-    where all differ, and less where runs are cut off at a horizon, whose spread the others must
-    tell. With n - 1 there the interval covers 88 % instead of 95 % (five runs, half cut off).
+    where all differ, and fewer where runs are cut off at a horizon, since only the others show the
+    spread. With n - 1 there the interval covers 88 % instead of 95 % (five runs, half cut off).
     """
     array = np.asarray(values, dtype=float)
     count, (_, alike) = len(array), np.unique(array, return_counts=True)
@@ -95,7 +96,7 @@ def difference_of(one: Values, other: Values, paired: bool = False) -> Estimate:
 
 
 def mean_of_estimates(found: Sequence[Estimate]) -> Estimate:
-    """Returns the mean of independent estimates, which count alike.
+    """Returns the unweighted mean of independent estimates.
 
     Its error is NaN where one of theirs is not known, or none has any.
     """
@@ -126,13 +127,13 @@ def _of_sum(value: float, squares: Sequence[float], freedoms: Sequence[float]) -
 
 
 def median_of(values: Values) -> tuple[Any, Any, Any]:
-    """Returns the median of independent values, with an interval that holds for every law.
+    """Returns the median of independent values, with an interval that holds for any distribution.
 
-    The interval goes from the k-th lowest value to the k-th highest, of the narrowest such that
-    hold the law's median with a probability of at least :data:`HELD`, since each value is below it
-    with a probability of at most one half (Thompson, Annals of Mathematical Statistics 7, 1936).
-    Of five values it is the lowest and the highest, of ten the second of either side. Nothing like
-    it holds for a mean: see ``results/intervals.md``.
+    The interval goes from the k-th lowest value to the k-th highest, with the largest k for which
+    it contains the median of the distribution with a probability of at least :data:`HELD`: each
+    value is below that median with a probability of at most one half (Thompson, Annals of
+    Mathematical Statistics 7, 1936). Of five values it is the lowest and the highest, of ten the
+    second of either side. No such interval exists for a mean: see ``results/intervals.md``.
 
     Args:
         values: float [n, ...], independent along the first axis; a value may be missing (NaN).
@@ -159,9 +160,10 @@ def probability_of_improvement(one: Values, other: Values) -> Interval:
     """Returns the probability that a run of ``one`` has a greater value than one of ``other``.
 
     P(X > Y) + P(X = Y) / 2 over all pairs: the Mann-Whitney statistic over the number of pairs
-    (Agarwal et al., NeurIPS 2021). Its variance is at most θ (1 - θ) / min(n, m), whatever the laws
-    (van Dantzig, Indagationes Mathematicae 13, 1951): that of a share of min(n, m) trials. So is
-    the interval (Clopper & Pearson, Biometrika 26, 1934), which is rather too wide than too narrow.
+    (Agarwal et al., NeurIPS 2021). For any distributions its variance is at most that of a share
+    of min(n, m) trials, θ (1 - θ) / min(n, m) (van Dantzig, Indagationes Mathematicae 13, 1951).
+    The interval is that of such a share (Clopper & Pearson, Biometrika 26, 1934), and errs on the
+    wide side.
     """
     a, b = np.asarray(one, dtype=float)[:, None], np.asarray(other, dtype=float)[None]
     share = float(((a > b) + (a == b) / 2).mean())
@@ -177,8 +179,8 @@ def probability_of_improvement(one: Values, other: Values) -> Interval:
 def holm(p_values: Sequence[float]) -> list[float]:
     """Returns p-values corrected for their number (Holm, Scandinavian J. of Statistics 6, 1979).
 
-    Who calls them significant at 5 % is wrong about any of them in at most 5 % of the cases. NaN,
-    where nothing could be tested, stays and does not count.
+    Calling them significant at 5 % is wrong about any of them in at most 5 % of the cases. NaN
+    stands for what could not be tested; it stays and does not count.
     """
     p = np.asarray(p_values, dtype=float)
     order = np.argsort(p)[: int(np.isfinite(p).sum())]  # NaN comes last

@@ -1,4 +1,4 @@
-"""Runs that can be compared, in groups that differ in nothing but the seed."""
+"""Sorts runs into comparable studies, and these into groups that differ only in the seed."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ class Group:
 
     @property
     def logs(self) -> list[Run]:
-        """The runs whose cycles differ; seeds that were trained together may have the same ones."""
+        """The runs with cycles of their own; seeds that were trained together may share them."""
         return list({run.whose_cycles: run for run in self.runs if run.cycles}.values())
 
 
 @dataclass(frozen=True)
 class Study:
-    """Groups that were measured alike on the same task.
+    """Groups with the same measurements on the same task.
 
     Attributes:
         title: the scale and the task.
@@ -90,12 +90,12 @@ class Study:
 
     @property
     def example(self) -> Run:
-        """A run, for what all have in common."""
+        """A run, which stands for what all have in common."""
         return self.groups[0].runs[0]
 
     @property
     def headline(self) -> str:
-        """The measurement that runs are summed up by."""
+        """The measurement by which runs are compared."""
         return self.example.headline
 
     @property
@@ -105,7 +105,7 @@ class Study:
 
     @cached_property
     def horizon(self) -> int:
-        """The length at which runs are compared: that of most finished runs."""
+        """The number of updates at which runs are compared, that of most finished runs."""
         lengths = Counter(run.updates for run in self.runs if run.finished)
         if not lengths:
             return max(run.updates for run in self.runs)
@@ -226,7 +226,7 @@ def _variant(run: Run) -> dict[str, Any]:
 
 
 def _without_seeds(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns settings with ``*`` for the seeds in the folders of checkpoints."""
+    """Returns settings with ``*`` in place of seeds in the folders of checkpoints."""
     found: dict[str, Any] = {}
     for key, value in settings.items():
         if isinstance(value, Mapping):

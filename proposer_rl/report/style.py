@@ -1,4 +1,4 @@
-"""The style of figures: one colour for each method, and the same bytes every time."""
+"""Styles and renders figures: a colour for each method, and the same bytes every time."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def looks(labels: Iterable[str]) -> dict[str, Look]:
 
 
 def style(look: Look, points: int = 2) -> dict[str, Any]:
-    """Returns matplotlib's arguments for a line of that look with so many points."""
+    """Returns matplotlib's arguments for a line in this style with some number of points."""
     alone = "." if points == 1 else ""
     every = max(1, -(-points // MARKED))
     return {
@@ -121,7 +121,7 @@ def style(look: Look, points: int = 2) -> dict[str, Any]:
 def finish(
     axes: Axes, x: str, y: str, means: Sequence[Column], *, rate: bool = False, zero: bool = False
 ) -> None:
-    """Names the axes and fits the ordinate to the means: intervals of few runs can be huge."""
+    """Names the axes and fits the ordinate to the means, as intervals of few runs can be huge."""
     axes.set(xlabel=x, ylabel=y)
     axes.margins(x=0.01)
     values = np.concatenate([[], *means])
@@ -136,14 +136,14 @@ def finish(
 
 
 def render(drawing: Drawing, *suffixes: str) -> list[bytes]:
-    """Returns a figure as ``svg`` or ``png`` files, of one layout, which takes most of the time."""
+    """Renders a figure as ``svg`` or ``png`` from one layout, which takes most of the time."""
     with rc_context(SETTINGS):
         figure = _laid_out(drawing)
         return [_render(figure, suffix) for suffix in suffixes]
 
 
 def in_few_colours(png: bytes) -> bytes:
-    """Returns a PNG in a third of its size: a page of vectors is five times as large."""
+    """Returns a PNG in few colours and a third of its size."""
     file = io.BytesIO()
     # The other ways to choose colours make those of two methods one.
     far, plain = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE

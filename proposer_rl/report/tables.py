@@ -1,4 +1,4 @@
-"""Tables as data, and as CSV and Markdown."""
+"""Holds tables and writes them as CSV and Markdown."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Cell = str | int | float | Interval | None
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of equally named cells.
+    """Rows with the same columns.
 
     Attributes:
         name: of its files.
@@ -75,12 +75,12 @@ def to_csv(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 
 def from_csv(text: str) -> str:
-    """Returns a text without the quote by which :func:`to_csv` keeps it from being a formula."""
+    """Removes the quote that :func:`to_csv` puts before a text that looks like a formula."""
     return text[1:] if text.startswith(tuple(f"'{begin}" for begin in FORMULA)) else text
 
 
 def write(cell: Cell, digits: int | None = None) -> str:
-    """Returns a cell as text; without ``digits`` as many as suit the size of the number."""
+    """Returns a cell as text, with as many digits as suit its size unless given."""
     if isinstance(cell, Interval):
         if digits is None:
             digits = 1 if max(map(abs, cell)) >= 2 else 3
@@ -100,7 +100,7 @@ def write(cell: Cell, digits: int | None = None) -> str:
 
 
 def escape_markdown(text: str) -> str:
-    """Returns text on one line that Markdown shows as it is."""
+    """Escapes a text for Markdown, on one line."""
     for character in "\\|<>`*_[]":
         text = text.replace(character, f"\\{character}")
     return " ".join(text.split())

@@ -1,4 +1,4 @@
-"""Logs that ``Teacher.log(file)`` writes in loops of one's own, and their figures."""
+"""Reads and draws the logs that ``Teacher.log(file)`` writes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ X = "levels told"
 
 
 class Log:
-    """Lines of a log.
+    """The lines of a log.
 
     Args:
         rows: the lines. ``teacher`` says whose each is, and ``levels_told`` how many levels that
@@ -63,7 +63,7 @@ class Log:
 
     @cached_property
     def drawn(self) -> dict[str, tuple[list[str], Column]]:
-        """By parameter the names of its bins, and the shares of the proposed levels, [m, n]."""
+        """The names of each parameter's bins, and the shares of proposed levels there, [m, n]."""
         found = {}
         for name, bins in self.rows[0]["drawn"].items():
             counts = np.array([[*row["drawn"][name].values()] for row in self.rows], float)
@@ -71,7 +71,7 @@ class Log:
         return found
 
     def curves(self) -> dict[str, Log]:
-        """Returns the lines of each teacher, from each state that a loop went on from.
+        """Splits the lines by teacher, and where a loop went on from an earlier state.
 
         Returns:
             By what tells them apart; a log that is one curve by the empty text.
@@ -119,12 +119,12 @@ def read_log(file: Path) -> Log:
     except (OSError, ValueError) as error:
         raise UnreadableRun(f"{file}: {printable(str(error))}") from error
     if not rows or not all("told" in row and "drawn" in row for row in rows):
-        raise UnreadableRun(f"{file}: is no log of a teacher, as teacher.log(file) writes it")
+        raise UnreadableRun(f"{file}: is not a log that teacher.log(file) has written")
     return Log(rows)
 
 
 def read_curves(files: Sequence[Path]) -> Curves:
-    """Reads logs, and tells their teachers apart.
+    """Reads logs and splits them by teacher.
 
     Raises:
         UnreadableRun: for a file that is no such log.
@@ -145,7 +145,7 @@ def read_curves(files: Sequence[Path]) -> Curves:
 
 
 def drawings(logs: Mapping[str, Log]) -> list[Drawing]:
-    """Returns figures: the entries of all logs side by side, and the levels of each."""
+    """Draws the entries of all logs side by side, and the levels of each log."""
     named = looks(logs)
     names = dict.fromkeys(name for log in logs.values() for name in log.entries)
     panels = [partial(_draw_entry, logs=logs, name=name, named=named) for name in names]
@@ -153,8 +153,8 @@ def drawings(logs: Mapping[str, Log]) -> list[Drawing]:
         Drawing(
             "teachers",
             "What came of the levels, and what the curricula tell",
-            "A point for each line of a log: what happened since the line before it. Of entries of "
-            f"several numbers the mean. The first {MOST_PANELS} entries.",
+            "Each line of a log is a point and tells what happened since the line before. Entries "
+            f"of several numbers are averaged. Only the first {MOST_PANELS} entries are drawn.",
             panels[:MOST_PANELS],
             3,
             named,
@@ -167,7 +167,7 @@ def drawings(logs: Mapping[str, Log]) -> list[Drawing]:
                 Drawing(
                     f"teachers_levels_{number}",
                     f"Levels that were proposed: {label}",
-                    "Shares of the bins of each parameter, line by line; the darker, the more.",
+                    "Shares of each parameter's bins, line by line; darker is more.",
                     maps[:MOST_PANELS],
                     3,
                 )

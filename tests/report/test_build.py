@@ -158,8 +158,8 @@ def test_a_report_is_replaced_and_nothing_else(
     ("arguments", "message"),
     [
         (["missing"], "there is no such folder"),
-        (["mine"], "mine: no run in it"),
-        (["runs", "--output=mine"], "one that was written before"),
+        (["mine"], "mine: holds no runs"),
+        (["runs", "--output=mine"], "use a new directory"),
         (["runs", "--threshold=nan"], "must be a number, got 'nan'"),
         (["runs", "--baseline=nobody"], "--baseline=nobody: must be one of target"),
         (["runs", "--compare=target,nobody"], "--compare=nobody: must be one of target"),

@@ -216,9 +216,9 @@ def test_what_cannot_be_published_is_one_line_and_changes_nothing(
     (tmp_path / "mine" / "thesis.tex").write_text("mine")
     (tmp_path / "file").write_text("mine")
     wrong = {
-        "runs: has files in it but no runs.csv.xz; give a new folder": [runs, runs],
-        "two runs are called target_0: ": [runs, tmp_path / "other", "new"],
-        "mine: has files in it": [runs, tmp_path / "mine"],
+        "runs: is not empty, and has no runs.csv.xz; use a new directory": [runs, runs],
+        "two runs have the name target_0: ": [runs, tmp_path / "other", "new"],
+        "mine: is not empty": [runs, tmp_path / "mine"],
         "file: Not a directory": [runs, tmp_path / "file"],
     }
     for message, (*folders, output) in wrong.items():

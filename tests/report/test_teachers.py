@@ -150,8 +150,8 @@ def test_logs_of_one_name_are_told_apart(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "is no log of a teacher"),
-        ('{"told": 1}\n', "is no log of a teacher"),
+        ("", "is not a log"),
+        ('{"told": 1}\n', "is not a log"),
         ("{\n", "line 1"),
     ],
 )

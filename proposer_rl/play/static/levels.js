@@ -4,7 +4,7 @@ import { ask, latest } from "./api.js";
 import { replace } from "./drawing.js";
 import { fill, inWords, means, picture } from "./gallery.js";
 import { Level } from "./level.js";
-import { $, checkpoint, forget, solver, state, tell, tellPlace, trouble } from "./page.js";
+import { $, checkpoint, forget, solver, state, tellPlace, trouble } from "./page.js";
 import { show } from "./showing.js";
 
 let seed = 0; // of the levels that are drawn
@@ -64,10 +64,10 @@ export function showOthers(drawn) {
 
 function offer({ levels, updates }) {
   fill($("gallery"), levels, take);
-  const after = updates === undefined ? "" : `update ${updates}`;
+  const after = updates === undefined ? "" : `After ${updates} updates`;
   const mean = means(levels);
-  const reached = mean && `mean over ${levels.length} ${inWords(mean)}`;
-  $("found").textContent = [after, reached].filter(Boolean).join(": ");
+  const reached = mean && `mean of ${levels.length} levels: ${inWords(mean)}`;
+  $("found").textContent = [after, reached].filter(Boolean).join(", ");
   const { board, chosen } = state;
   if (!board && levels.length) display(levels.find((one) => one.name === chosen) ?? levels[0]);
   else show();
@@ -88,9 +88,8 @@ function display(one) {
   state.chosen = one.name;
   $("picture").src = picture(one).src;
   $("picture").alt = [one.name, ...one.text].join(", ");
-  $("caption").textContent = [one.name, ...results].join(" · ");
+  $("caption").textContent = [one.name, ...results].join(": ");
   $("lines").textContent = one.text.join("\n");
-  tell(results.length ? `${one.name}: ${results[0]}` : "");
   show();
 }
 
