@@ -10,7 +10,7 @@ from threading import RLock
 
 import torch
 
-DEFAULT = RLock()  # torch's default generator is one for all threads
+DEFAULT = RLock()  # all threads share torch's default generator
 
 
 class Streams:

@@ -20,7 +20,7 @@ from proposer_rl.settings import ArgumentError, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Space
 
-LEAST_STORED = 6  # earlier episodes, below which progress is 0
+LEAST_STORED = 6  # earlier episodes; with fewer, progress is 0
 TwoOrMore = Annotated[int, Interval(ge=2, le=1_000_000)]
 
 

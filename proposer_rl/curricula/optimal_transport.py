@@ -19,10 +19,10 @@ from proposer_rl.task import Space
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Of a program, for steps of about ten seconds: 250 items in a row take as long as 8³ bins.
+# Bins for which a step takes about ten seconds: 250 items in a row take as long as 8³ bins.
 MOST_IN_A_ROW, MOST_OF_A_GRID = 256, 512
-NOTHING = 1e-6  # a share that is rounding of the solver's
-SLACK = 1e-6  # of the reach, where the solver finds nothing at the nearest distribution itself
+NOTHING = 1e-6  # shares below this are rounding of the solver
+SLACK = 1e-6  # of the reach, if the solver finds nothing at the nearest distribution itself
 
 
 class TransportCurriculum(BinCurriculum):
@@ -194,7 +194,7 @@ def step_towards(
             A_eq=equal.tocsr(),
             b_eq=np.concatenate([target[to], now[fro], np.zeros(count)]),
             method="highs",
-            # Presolving takes what the shares are off by, 1e-16 in their sums, for a contradiction.
+            # Presolving would take rounding, 1e-16 in the sums of shares, for a contradiction.
             options={"presolve": False},
         )
         if result.x is not None:

@@ -50,15 +50,15 @@ Labels = Literal["success", "above_worst"]
 Features = Callable[[Levels], Tensor]
 """Maps levels [K, n] to the features of a model: float [K, n, F], each about -1 to 1."""
 
-KEPT = 4  # half-lives, after which a batch is forgotten
+KEPT = 4  # half-lives after which a batch is forgotten
 STEPS = 50  # of Newton's method, at most
 HALVINGS = 8  # of a step, at most, until it makes the loss no larger
-CLOSE = 1e-10  # coefficients that change no more than this are found
-EQUAL = 1e-6  # returns that differ no more than this are equal, in units of the worst one
+CLOSE = 1e-10  # coefficients have converged when they change by less than this
+EQUAL = 1e-6  # relative difference up to which returns count as equal
 
 ANSWERED = ("performance", "exact_performance")
-LOGGED = 100  # batches at most, whose predictions a log is about: loops may go on without one
-PARTS = 10  # of the probabilities from 0 to 1, in which what was predicted is compared
+LOGGED = 100  # batches at most whose predictions are kept for a log, which loops may never ask for
+PARTS = 10  # intervals of [0, 1] in which predictions are compared with outcomes
 
 
 def logistic_ridge(
@@ -133,7 +133,7 @@ class OutcomeModel:
         self, *, labels: Labels = "success", ridge: float = 0.3, half_life: float = 12.0
     ) -> None:
         self._labels, self._ridge, self._half_life = labels, ridge, half_life
-        # Outcomes do not always have an entry that nobody needs.
+        # Entries that are not required may be missing in some outcomes.
         self.required_results = ("return", "success") if labels == "success" else ("return",)
         self._batches: list[dict[str, Tensor]] = []
         self._worst = torch.tensor(torch.inf, dtype=torch.float64)
@@ -327,9 +327,9 @@ class Predictions:
 def calibration(predicted: Tensor, label: Tensor) -> dict[str, Any]:
     """Compares probabilities that were predicted with what happened, ready for JSON.
 
-    ``brier``, the mean squared error of the predicted probabilities, and ``brier_constant``, that
-    of one number for all; ``reliability``, for each tenth of the probabilities how many were
-    predicted there, their mean, and the mean of what it was.
+    ``brier`` is the mean squared error of the probabilities, and ``brier_constant`` that of the
+    best constant. ``reliability`` has for each tenth of the probabilities the number of
+    predictions, their mean, and the mean of the labels.
 
     Args:
         predicted: probabilities float64 [m].

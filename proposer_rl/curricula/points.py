@@ -15,7 +15,7 @@ from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels, Space, refuse_many_bins, refuse_unfit_bins
 
-CHUNK = 2**16  # places that are compared at once
+CHUNK = 2**16  # places to compare at once
 Place = Annotated[float, Interval(ge=-1, le=1)]
 """A parameter's place in its range, from -1 to 1."""
 

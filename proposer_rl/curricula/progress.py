@@ -65,7 +65,7 @@ class LearningProgressCurriculum(BinCurriculum):
         probed = probes if source == "exact" else 0
         self._source, self._probes = source, Probes(space, probed, measure)
         self._fast, self._slow, self._exploration = fast, slow, exploration
-        # Sum and number of what came of each bin since the last scoring pass, [N].
+        # Sum and number of the results in each bin since the last scoring pass, [N].
         self._episodes: list[Tensor] = []
 
     def score(self, student: Student, count: int, rng: Streams) -> None:

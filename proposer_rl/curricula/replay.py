@@ -53,11 +53,11 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space
 
 Edit = Callable[[Levels, int, Sequence[torch.Generator]], Levels]
-"""Levels [K, n] after so many small random edits each, those of row k from generator k."""
+"""Edits levels [K, n] by a number of small random changes each; row k draws from generator k."""
 Parents = Literal["batch", "easy"]
 
-EASY = 4  # parents of a batch of edits, where they are not all of the batch
-SHOWN = 6  # levels of each kind that a reader is shown
+EASY = 4  # parents of a batch of children, unless all of the batch are
+SHOWN = 6  # levels of each kind in a report
 
 
 class ReplayCurriculum(Curriculum):

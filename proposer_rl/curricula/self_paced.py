@@ -25,9 +25,9 @@ Floats = NDArray[np.float64]
 Goal = Callable[[Floats], tuple[float, Floats]]  # a value and its gradient
 Deviation = Annotated[float, Interval(gt=0, le=2)]
 
-WIDEST = 2.0  # standard deviation, with which a Gaussian is nearly uniform in the box
-SAMPLED = 1000  # levels of the target, whose mean and deviation are taken
-SLACK = 1e-4  # of the constraints, within which a solution is taken
+WIDEST = 2.0  # standard deviation at which a Gaussian is nearly uniform in the box
+SAMPLED = 1000  # levels of the target from which its mean and deviation are estimated
+SLACK = 1e-4  # violation of the constraints at which a solution is still accepted
 
 
 class SelfPacedCurriculum(CountingCurriculum):

@@ -49,11 +49,11 @@ class Queue:
     def __init__(self, curriculum: Curriculum, student: Student, like: Levels, count: int) -> None:
         self.curriculum, self._student = curriculum, student
         self._ledger = Ledger({"episode": object})
-        self._at = 0  # the next id; what is from there on waits
+        self._at = 0  # the next id to play; later ones wait
         self.levels = like.unsqueeze(0).expand(count).clone()  # that are played, or set
         self._playing = [-1] * count
         self._over: dict[int, list[int]] = defaultdict(list)
-        self._most = count  # episodes that ended in an update
+        self._most = count  # episodes that ended in the last update
         self.steps = torch.zeros(count, dtype=torch.int64)  # of the present episodes
 
     def propose(self, rng: Streams) -> None:

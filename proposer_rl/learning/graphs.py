@@ -24,7 +24,7 @@ from torch.utils._pytree import tree_leaves
 
 from proposer_rl.settings import ArgumentError
 
-WARM_UPS = 2  # calls of the function itself, in the last of which it is recorded
+WARM_UPS = 2  # calls before replaying; the last of them is recorded
 
 
 class GraphError(ArgumentError):

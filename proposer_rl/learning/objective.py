@@ -24,7 +24,7 @@ from torchrl.objectives.value.functional import reward2go
 from proposer_rl.models import ActorCritic
 from proposer_rl.settings import settings
 
-LEAST_DISCOUNT = 1e-7  # below it, float32 does not know the next reward from none
+LEAST_DISCOUNT = 1e-7  # below this the next reward vanishes in float32
 
 
 @settings
@@ -267,7 +267,7 @@ def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int
 
 
 class DivergedError(ArithmeticError):
-    """A number is not finite; the message is one line that says which, and in which replica."""
+    """A number is not finite; the message is one line that says which and in which replica."""
 
     exit_code = 3
 

@@ -32,7 +32,7 @@ from proposer_rl.learning.training_batch import Minibatches, Statistics
 from proposer_rl.models import ActorCritic, Population, one_copy
 
 VALUES = ("state_value", ("next", "state_value"))
-DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # beside the terms, where a loss has them
+DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # besides the terms, if a loss has them
 
 
 class Update(NamedTuple):

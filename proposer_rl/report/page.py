@@ -268,7 +268,7 @@ def _command(run: Run) -> str:
         return f"prl.train({call}{')' if run.shared_by > 1 else ', seed=seed)  # seed='}"
     arguments = run.facts.get("arguments", {})
     paths, config = arguments.get("pythonpath"), arguments.get("config_dir")
-    own = ("seed=", "seeds=", "hydra.", "sweep=", "+sweep=", "compute.", "logger")
+    own = ("seed=", "seeds=", "hydra.", "+sweep=", "compute.", "logger")
     shown = [word for word in words if not word.startswith(own)]
     many, seeds = ["-m"], "seed="
     if run.shared_by > 1:

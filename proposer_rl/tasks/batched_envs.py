@@ -301,8 +301,7 @@ class BatchedTask(Task):
     @property
     def about(self) -> dict[str, str]:
         """Returns facts about the task for readers, by their labels."""
-        target = "; ".join(f"{name} {bins}" for name, bins in self.target.bins.items())
-        return {"Target": target, **super().about}
+        return {"Target": str(self.target), **super().about}
 
     def environment(self, levels: TensorDictBase) -> EnvBase:
         """Returns an environment of levels [*B]."""

@@ -427,6 +427,9 @@ class ParameterSpace:
                 levels[name] = part.moved(old, noise).where(which == i, old)
         return levels.to(self._device)
 
+    def __str__(self) -> str:
+        return "; ".join(f"{name} {part}" for name, part in self.bins.items()) or "any level"
+
     def _drawn_seeds(self, shape: torch.Size, generator: torch.Generator) -> dict[str, Tensor]:
         if not self._seeded:
             return {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,11 +15,10 @@ from torch import Tensor, nn
 
 from proposer_rl import curricula as c
 from proposer_rl import methods, models
-from proposer_rl.curricula import Curriculum, Filtered, FirstOrderProposer
+from proposer_rl.curricula import Filtered, FirstOrderProposer
 from proposer_rl.learning import PPO, DivergedError, PPOSettings, SolverSettings
 from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.methods import Components
-from proposer_rl.models.actor_critic import ActorCritic
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
@@ -64,6 +64,9 @@ class Skills:
         of_bins = agent.skills.gather(1, levels.clamp(min=0))
         target = (agent.skills @ self.wanted).unsqueeze(1)
         return TensorDict({"return": torch.where(levels < 0, target, of_bins)}, levels.shape)
+
+    def probe(self, agent: nn.Module, levels: Tensor) -> Tensor:
+        return torch.ones(len(self.agent.skills), len(levels), 3)
 
 
 def taught(task: Any, learner: Any = None) -> c.TaskStudent:
@@ -164,59 +167,46 @@ def test_the_log_has_standard_errors_and_how_even_the_shares_are() -> None:
 WANTED = [0.0, 0.0, 1.0, 0.0, 0.5, 0.0]
 
 
-class Seen(Skills):
-    """Skills that a Proposer looks at."""
-
-    def probe(self, agent: nn.Module, levels: Tensor) -> Tensor:  # type: ignore[override]
-        return torch.ones(len(self.agent.skills), len(levels), 3)
-
-
-def agent() -> ActorCritic:
+def agent() -> models.ActorCritic:
     torch.manual_seed(0)
     head = models.ProblemHead(8, P, BINS, hidden=16, bands=4)
     network = models.ProposerNetwork(head, nn.Linear(3, 8), context=8, hidden=8)
     return models.proposer_actor_critic(network, models.categorical)
 
 
-def ppo(**settings: Any) -> PPOSettings:
-    return PPOSettings(**{"learning_rate": 1e-2, "epochs": 4, "entropy_coeff": 0.02, **settings})
+def proposer(task: Skills, **settings: Any) -> FirstOrderProposer:
+    numbers = {"learning_rate": 1e-2, "epochs": 4, "entropy_coeff": 0.02, **settings}
+    return rewarded(task.space, task.target, agent(), PPOSettings(**numbers))
 
 
-def proposer(task: Seen, **settings: Any) -> FirstOrderProposer:
-    return rewarded(task.space, task.target, agent(), ppo(**settings))
+rewarded = partial(FirstOrderProposer, probe_levels=2, target_levels=3, step=1.0, measure="return")
 
 
-def rewarded(*parts: Any) -> FirstOrderProposer:
-    return FirstOrderProposer(*parts, probe_levels=2, target_levels=3, step=1.0, measure="return")
+@pytest.mark.parametrize("times", [1, 3])
+def test_every_problem_is_credited_with_its_own_alignment(times: int) -> None:
+    """Also those on which the Solver does not train, which are those with the lowest scores.
 
-
-def the_last_of(curriculum: Curriculum, times: int) -> Curriculum:
-    """Trains on one in so many levels: those with the highest scores, which are the last."""
-    scores = GivenScores(torch.arange(float(times * P)))
-    return curriculum if times == 1 else Filtered(curriculum, scores, times=times, temperature=1e-3)
-
-
-def step_by_hand(expected: ActorCritic, streams: Streams, times: int, kept: slice) -> Tensor:
-    """Makes Adam's first step, on the objective of draws that are paid as their bins are wanted.
-
-    Returns:
-        The last P draws.
+    The gradient of Adam's first step is of draws that are rewarded as their bins are wanted, up to
+    a factor, which standardising takes out.
     """
+    task = Skills(WANTED)
+    curriculum = proposer(task, epochs=1, entropy_coeff=0.3, max_grad_norm=100.0)
+    expected, student = copy.deepcopy(curriculum.agent), taught(task)
+    scores = GivenScores(torch.arange(float(times * P)))
+    filtered = Filtered(curriculum, scores, times=max(times, 2), temperature=1e-3)
+    batch = (curriculum if times == 1 else filtered).propose(student, P, Streams(0))
+    assert student.evaluations == 3 + 2 * P * times
     seen = TensorDict({"probes": torch.ones(1, 2, 3)}, [1])
     policy = torch.distributions.Categorical(logits=expected(seen)["logits"][0])
-    noise = torch.rand(times, 1, P, generator=streams.generator("choices"))
-    choices = models.draw_at(policy, noise)[kept]  # [times, 1, P]
-    paid = torch.tensor(WANTED)[choices]  # up to a factor, which standardising takes out
-    advantage = (paid - paid.mean()) / paid.std()
-    loss = -(advantage * policy.log_prob(choices)).mean() - 0.3 * policy.entropy().mean()
+    noise = torch.rand(times, 1, P, generator=Streams(0).generator("choices"))
+    choices = models.draw_at(policy, noise)  # [times, 1, P]
+    reward = torch.tensor(WANTED)[choices]
+    advantage = (reward - reward.mean()) / reward.std()
     adam = torch.optim.Adam(expected.parameters(), lr=1e-2, eps=1e-5)
-    loss.backward()
+    (-(advantage * policy.log_prob(choices)).mean() - 0.3 * policy.entropy().mean()).backward()
     adam.step()
-    return choices[-1, 0]
-
-
-def assert_same_weights(found: ActorCritic, expected: ActorCritic) -> None:
-    for one, other in zip(found.parameters(), expected.parameters(), strict=True):
+    assert sorted(batch.levels.tolist()) == sorted(choices[-1, 0].tolist())
+    for one, other in zip(curriculum.agent.parameters(), expected.parameters(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
 
@@ -227,7 +217,7 @@ def assert_same_weights(found: ActorCritic, expected: ActorCritic) -> None:
 def test_numbers_that_went_wrong_are_told_where_they_arise(
     paid: float, told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    task = Seen(WANTED)
+    task = Skills(WANTED)
     curriculum = proposer(task)
     monkeypatch.setattr(curriculum, "reward", lambda *_: (torch.full((P,), paid), {}))
     with pytest.raises(DivergedError, match=f"^the Proposer: {told}"):
@@ -235,7 +225,7 @@ def test_numbers_that_went_wrong_are_told_where_they_arise(
 
 
 def test_it_learns_to_choose_what_the_target_needs() -> None:
-    task = Seen(WANTED)
+    task = Skills(WANTED)
     curriculum = proposer(task)
     for update in range(60):
         student = taught(task)
@@ -245,22 +235,9 @@ def test_it_learns_to_choose_what_the_target_needs() -> None:
     assert (batch.levels == 2).float().mean() > 0.8
 
 
-@pytest.mark.parametrize("times", [1, 3])
-def test_every_problem_is_credited_with_its_own_alignment(times: int) -> None:
-    """Also those that the Solver does not train on."""
-    task = Seen(WANTED)
-    curriculum = proposer(task, epochs=1, entropy_coeff=0.3, max_grad_norm=100.0)
-    expected, student = copy.deepcopy(curriculum.agent), taught(task)
-    batch = the_last_of(curriculum, times).propose(student, P, Streams(0))
-    assert student.evaluations == 3 + 2 * P * times
-    last = step_by_hand(expected, Streams(0), times, slice(None))
-    assert sorted(batch.levels.tolist()) == sorted(last.tolist())
-    assert_same_weights(curriculum.agent, expected)
-
-
 def test_all_that_it_computes_with_is_on_the_tasks_device() -> None:
     """The bounds of TorchRL's clipping, and Adam's moments after a checkpoint, read to the CPU."""
-    begun, task = proposer(Seen(WANTED)), Seen(WANTED)
+    begun, task = proposer(Skills(WANTED)), Skills(WANTED)
     begun.propose(taught(task), P, Streams(0))
     there = SimpleNamespace(sample=lambda count, generator: torch.full((count,), -1, device="meta"))
     elsewhere = rewarded(task.space, there, agent().to("meta"), PPOSettings())
@@ -276,7 +253,7 @@ def test_all_that_it_computes_with_is_on_the_tasks_device() -> None:
 
 
 def test_a_proposer_that_has_not_begun_resumes_too() -> None:
-    task = Seen(WANTED)
+    task = Skills(WANTED)
     one, other = proposer(task), proposer(task)
     other.load_state_dict(one.state_dict())
     assert one.log() == {}

@@ -17,7 +17,7 @@ REFUSED = [
     ([*CARS, "+method=regret"], "GymnasiumTask must define optimal_return(levels)"),
     ([*CARS, "+method=pace"], "must define differentiable_performance(agent, levels)"),
     ([*CARS, "+method=plr", "compute.collector=multiprocess"],
-     "this method trains no replicas that workers could have; leave compute.collector=single"),
+     "this method trains no replicas in workers; leave compute.collector=single"),
     ([*CARS, "+method=first_order_proposer"], "needs a student with target_direction"),
     ([*SEEDS, "+method=plr", "+filter=model"], "space: must have axes"),
     ([*VIEWS, "+method=first_order_gain"], "ViewMazeTask must define differentiable_performance"),

@@ -264,7 +264,7 @@ class ProcessVectorEnv:
             codes = [process.exitcode for process in self.processes if process.exitcode]
             raise LostProcessError(
                 f"vectorization=async: a process of the environments was lost (exit code {codes}; "
-                "-9: killed, mostly for want of memory)"
+                "-9 mostly means that memory ran out)"
             ) from error
         for failed, answer in answers:
             if failed:

@@ -184,8 +184,7 @@ class GymnasiumTask(Task):
         evaluation = self._evaluation
         return {
             "Environment": f"{self.title}, at most {self.max_steps} steps",
-            "Target": "; ".join(f"{name} {bins}" for name, bins in self.target.bins.items())
-            or "any level",
+            "Target": str(self.target),
             "Measured on": f"{evaluation.levels} fixed levels of the target, and as many of "
             f"all bins; {evaluation.episodes} episode(s) on each, with "
             f"{evaluation.actions.replace('_', ' ')} actions",
@@ -249,8 +248,8 @@ class GymnasiumTask(Task):
         """
         if self._unpaid():
             raise ValueError(
-                "transforms: these are not applied to observations of a plain environment; put "
-                "run.solver().actor() into a TransformedEnv with them"
+                "transforms: a plain environment does not apply these; use run.solver().actor() "
+                "in a TransformedEnv with them"
             )
         env = LevelPlayer(self._make, self._parameters, self._first)
         env.close()

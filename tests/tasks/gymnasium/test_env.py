@@ -119,7 +119,9 @@ def test_a_process_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) 
     env.rollout(1)
     env._vector._pipes[0].send(("step", ([0],)))
     env.close()
-    assert env._vector.processes[0].exitcode == -signal.SIGKILL
+    (process,) = env._vector.processes
+    process.join(60)
+    assert process.exitcode == -signal.SIGKILL
 
 
 def test_a_process_that_waits_for_its_answer_to_be_read_ends() -> None:
