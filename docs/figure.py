@@ -1,4 +1,4 @@
-"""Draws the README's figure from the published runs, and that of terrain levels from arithmetic.
+"""Draws the figures of the README and of the pages on how it works and on terrain levels.
 
 ``.venv/bin/python docs/figure.py``
 """
@@ -11,6 +11,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from PIL import Image
 
 from proposer_rl.report.statistics import median_of
@@ -80,6 +81,55 @@ def _stationary(success: float, rows: int) -> np.ndarray:
     return np.linalg.lstsq(balance, np.eye(rows + 1)[-1])[0]
 
 
+def how_it_works() -> None:
+    """Draw the two loops, one inside the other, to how_it_works.png."""
+    figure, axes = plt.subplots(figsize=(8, 4.4), layout="constrained")
+    axes.set(xlim=(0, 100), ylim=(-5, 54))
+    axes.axis("off")
+    for x, y, width, height, colour in (
+        (34, 4, 64, 48, "#FFF3E6"),
+        (38, 7, 56, 23, "#E6F0F8"),
+    ):
+        box = FancyBboxPatch((x, y), width, height, boxstyle="round,pad=0.6", fc=colour, ec="none")
+        axes.add_patch(box)
+    for x, y, width, height, colour, text in (
+        (3, 20, 23, 15, "#D55E00", "Proposer\n(teacher)\na PPO agent"),
+        (40, 12, 20, 12, "#0072B2", "Solver\n(student)\na PPO agent"),
+        (72, 12, 20, 12, "#555555", "levels\nfor example mazes"),
+    ):
+        box = FancyBboxPatch((x, y), width, height, boxstyle="round,pad=0.6", fc=colour, ec="none")
+        axes.add_patch(box)
+        middle = x + width / 2, y + height / 2
+        axes.text(*middle, text, color="white", ha="center", va="center", fontsize=10)
+    for start, end, bend in (
+        ((61, 21), (71, 21), 0),
+        ((71, 15), (61, 15), 0),
+        ((15, 36), (82, 25.5), -0.38),
+        ((50, 10.5), (15, 19), -0.25),
+    ):
+        style = f"arc3,rad={bend}"
+        arrow = FancyArrowPatch(
+            start, end, connectionstyle=style, arrowstyle="-|>", mutation_scale=16, color="black"
+        )
+        axes.add_patch(arrow)
+    for x, y, text, where in (
+        (66, 22, "action", "center"),
+        (66, 9.6, "observation,\nreward", "center"),
+        (40, 26.5, "inner loop: a step is a move", "left"),
+        (36, 49, "outer loop: a step is an update of the Solver", "left"),
+        (36, 36, "action: which levels the Solver trains on", "left"),
+        (
+            24,
+            -4,
+            "observation: what the Solver does on probe levels\n"
+            "reward: how much its return on the target rose",
+            "center",
+        ),
+    ):
+        axes.text(x, y, text, ha=where, fontsize=9)
+    _save(figure, "how_it_works.png")
+
+
 def _save(figure: plt.Figure, name: str) -> None:
     file = Path(__file__).parent / name
     figure.savefig(file, dpi=100)
@@ -89,3 +139,4 @@ def _save(figure: plt.Figure, name: str) -> None:
 if __name__ == "__main__":
     main(*map(Path, sys.argv[1:]))
     terrain_levels()
+    how_it_works()

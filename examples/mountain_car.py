@@ -1,12 +1,12 @@
-"""A task of your own: on which mountain cars should a Solver train to master a weak engine?
+"""Write your own task: on which mountain cars should a Solver train to master a weak engine?
 
-A level is a gravity, an engine's power and a start. The Solver, an MLP, is to master a weak engine,
-with which chance hardly ever reaches the top; a Proposer mixes 20 kinds of cars. `MountainCarTask`
-gives an environment, a network and pictures; what it stands on is in `proposer_rl/task/base.py`.
+A level is a gravity, an engine's power and a start. The target is a weak engine, with which random
+actions hardly ever reach the top; a Proposer mixes 20 kinds of cars. `MountainCarTask` defines an
+environment, a network and pictures; its base class is in `proposer_rl/task/base.py`.
 
     PYTHONPATH=examples bin/train --config-dir examples/conf task=mountain_car +method=perf_gain
 
-trains, resumes, is watched (bin/watch), reported (bin/report) and evaluated (bin/eval) like mazes.
+trains on it. Then use bin/watch, bin/report and bin/eval as for any other run.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TOP = 0.5
 
 
 class MountainCar(EnvBase):
-    """Moore's car in a valley, a batch of them; an action holds for five physical steps."""
+    """A batch of Moore's cars in a valley; an action lasts for five physical steps."""
 
     def __init__(self, levels: TensorDictBase) -> None:
         super().__init__(batch_size=(batch := levels.batch_size))
@@ -66,7 +66,7 @@ class MountainCar(EnvBase):
 
 
 class Cars:
-    """Cars of some kinds; also the Proposer's space, whose bins are the kinds."""
+    """Cars of some kinds; as the Proposer's space, its bins are the kinds."""
 
     size = len(KINDS)
     coordinates = 2 * (KINDS - KINDS.amin(0)) / (KINDS.amax(0) - KINDS.amin(0)) - 1
@@ -87,7 +87,7 @@ class Cars:
 
 
 class Network(nn.Module):
-    """Logits of three actions and a value."""
+    """A network from observations to logits of three actions and a value."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -98,7 +98,7 @@ class Network(nn.Module):
 
 
 class MountainCarTask(Task):
-    """Levels are tensordicts; the Solver is an MLP, measured by its most probable actions."""
+    """A task whose levels are tensordicts; evaluation plays the most probable actions."""
 
     title, noun, batched = "mountain cars", "cars", True
     key = "Blue: start. Orange: top. Purple: where the car was."
@@ -135,7 +135,7 @@ class MountainCarTask(Task):
 
 
 def draw_valley(places: Sequence[float]) -> np.ndarray:
-    """The valley, the top, and where a car was: uint8 [60, 120, 3]."""
+    """Draw the valley, the top, and the places of a car: uint8 [60, 120, 3]."""
 
     def at(x: float) -> tuple[float, float]:
         return 120 * (x + 1.2) / 1.8, 30 - 22 * math.sin(3 * x)

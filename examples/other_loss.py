@@ -1,12 +1,12 @@
-"""The Proposer trained with other losses of TorchRL's: A2CLoss and ReinforceLoss.
+"""Train the Proposer with other losses of TorchRL's: A2CLoss and ReinforceLoss.
 
-A method takes a factory of the loss, called with actor and critic. These two hold only for the
-policy that collected the rollout, so each gets one gradient step on it, and a larger one than
-PPO's. All else is as with PPO, also the advantages against the other copies.
+A method takes a function that makes the loss from actor and critic. These two losses are valid only
+for the policy that collected the rollout, so that each takes a single gradient step, larger than
+PPO's. Everything else is as with PPO, including advantages relative to the other replicas.
 
     python examples/other_loss.py [cycles]
 
-On the command line a method is a function that takes a run (examples/conf/method/a2c.yaml):
+On the command line, by a method that is a function of a run (examples/conf/method/a2c.yaml):
 
     PYTHONPATH=examples bin/train --config-dir examples/conf +method=a2c +scale=quick \
         proposer.ppo.epochs=1 proposer.ppo.updates=1 proposer.ppo.learning_rate=0.01
@@ -31,24 +31,24 @@ UPDATES = 20
 
 
 def a2c(actor: TensorDictModuleBase, critic: TensorDictModule) -> A2CLoss:
-    """Mnih et al. 2016. It takes an action as one event: ``problems`` need ``ratio=joint``."""
+    """Make A2C's loss (Mnih et al. 2016); actions of kind ``problems`` need ``ratio=joint``."""
     return A2CLoss(
         actor, critic, functional=False, reduction="none", critic_coeff=0.5, loss_critic_type="l2"
     )
 
 
 def reinforce(actor: TensorDictModuleBase, critic: TensorDictModule) -> ReinforceLoss:
-    """Williams 1992."""
+    """Make REINFORCE's loss (Williams 1992)."""
     return ReinforceLoss(actor, critic, functional=False, reduction="none", loss_critic_type="l2")
 
 
 def a2c_proposer(run: Components) -> ProposerCurriculum:
-    """The method that the command line names."""
+    """Make the curriculum; the command line names this function."""
     return proposer(run, a2c, reward=performance_gain)
 
 
 def main(cycles: int = 20) -> None:
-    """Train a Proposer for mountain cars with each; every cycle begins with a fresh Solver."""
+    """Train a Proposer for mountain cars with each; every cycle begins with a new Solver."""
     torch.set_num_threads(1)
     ppo = PPOSettings(horizon=40, learning_rate=4e-3)
     task = MountainCarTask(

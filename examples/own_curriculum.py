@@ -1,4 +1,4 @@
-"""A curriculum of your own: levels that the Solver has failed on come again.
+"""Write your own curriculum: levels that the Solver failed on come again.
 
 python examples/own_curriculum.py [updates]
 PYTHONPATH=examples bin/train --config-dir examples/conf +method=own_curriculum +scale=quick
@@ -12,9 +12,9 @@ import proposer_rl as prl
 
 
 class Again(prl.Curriculum):
-    """Draws levels of a space, and those of the last batch that were failed on."""
+    """Draws levels of a space, and repeats those of the last batch that were failed."""
 
-    state = ("failed",)  # what a resumed run needs
+    state = ("failed",)  # attributes that a checkpoint keeps
 
     def __init__(self, space):
         self.space, self.failed = space, space.sample(1, torch.Generator())[:0]

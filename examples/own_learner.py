@@ -1,8 +1,8 @@
-"""Learners of your own in the meta-environment: softmax regression, without PPO and episodes.
+"""Write your own learner for the meta-environment: softmax regression, without PPO and episodes.
 
-The meta-environment trains K learners side by side on what a policy proposes, and rewards it for
-what they have learnt. What it asks of learners is :class:`proposer_rl.meta.env.Learner`, and of
-a task no more than is here. A level is an example to learn from, a bin its class.
+The meta-environment trains K learners side by side on what a policy proposes, and rewards the
+policy for what they learn. :class:`proposer_rl.meta.env.Learner` lists what a learner must have;
+`task` below is all that is needed of a task. A level is an example to learn from, a bin its class.
 
     python examples/own_learner.py
 """
@@ -24,24 +24,24 @@ MEANS = torch.tensor([[0.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])  # of three classe
 
 
 class Examples:
-    """The space: examples [K, P] of the classes that are asked for."""
+    """A space whose levels are examples of the three classes."""
 
     size, axes = 3, {"class": [0.0, 1.0, 2.0]}
     coordinates = torch.tensor([[-1.0], [0.0], [1.0]])
 
     def generate(self, choices: Tensor, generators: list[torch.Generator]) -> TensorDict:
-        """Points around the means of their classes; learner k's from generator k."""
+        """Draw points [K, P] around the means of their classes, of learner k from generator k."""
         noise = [torch.randn(choices.shape[1], 2, generator=g) for g in generators]
         point = MEANS[choices] + 0.5 * torch.stack(noise)
         return TensorDict({"point": point, "label": choices}, choices.shape)
 
     def sample(self, count: int, generator: torch.Generator) -> TensorDict:
-        """The target: all classes alike."""
+        """Draw from the target, all classes alike."""
         return self.generate(torch.randint(3, (1, count), generator=generator), [generator])[0]
 
 
 class SoftmaxRegression:
-    """K classifiers, each trained by gradient descent on P examples at a time."""
+    """K classifiers, each of which learns by gradient descent on P examples at a time."""
 
     horizon = 1  # a step on each example
 
@@ -55,7 +55,7 @@ class SoftmaxRegression:
         )
 
     def update(self, generators: list[torch.Generator]) -> Update:
-        """A step down the mean cross-entropy of each."""
+        """Take a step down the mean cross-entropy of each."""
         error = functional.one_hot(self.examples["label"], 3) - logits(
             self.agent, self.examples
         ).softmax(-1)
@@ -63,24 +63,24 @@ class SoftmaxRegression:
         return Update(self.examples, TensorDict({}, [self.copies]))
 
     def check(self, first: int = 0) -> None:
-        """Nothing here can diverge."""
+        """Do nothing, as nothing here can diverge."""
 
     def snapshot(self) -> TensorDict:
-        """The weights, [K]."""
+        """Return a copy of the weights, [K]."""
         return TensorDict({"weights": self.agent.clone()}, [self.copies])
 
     def restore(self, snapshot: TensorDictBase) -> None:
-        """Put them back."""
+        """Put weights back."""
         self.agent = snapshot["weights"].clone()
 
 
 def logits(weights: Tensor, examples: TensorDictBase) -> Tensor:
-    """Of K classifiers on examples [n] or each on its own [K, n]: float [K, n, 3]."""
+    """Return logits of K classifiers on examples [n] or each on its own [K, n]: [K, n, 3]."""
     return examples["point"] @ weights
 
 
 def task() -> Any:
-    """What the view of the learners asks of a task: log-likelihood as the return."""
+    """Make the task that the view of the learners needs, with log-likelihood as the return."""
 
     def performance(weights: Tensor, examples: TensorDictBase, _: object) -> TensorDict:
         log = logits(weights, examples).log_softmax(-1)
@@ -93,7 +93,7 @@ def task() -> Any:
 
 
 def meta_environment(copies: int = 4, updates: int = 20) -> SolverTrainingEnv:
-    """One step is so many updates of every classifier, on 16 examples each."""
+    """Make the environment, in which a step is so many updates on 16 examples each."""
     return SolverTrainingEnv(
         SoftmaxRegression(copies, batch_size=16),
         view=SolverView(task(), validation_levels=256, probe_levels=4),
@@ -105,7 +105,7 @@ def meta_environment(copies: int = 4, updates: int = 20) -> SolverTrainingEnv:
 
 
 def main() -> None:
-    """The reward of a meta-episode with all classes alike, and with the first one alone."""
+    """Print the reward of an episode on all classes alike, and of one on the first class."""
     env = meta_environment()
     env.fork(env.solvers.snapshot()[0], Streams(0))
     for name, number in (("all classes alike", 0.0), ("the first class above all", -20.0)):

@@ -1,12 +1,12 @@
-"""A reward of your own: the Proposer is rewarded for levels that are solved about half of the time.
+"""Write your own reward: the Proposer is rewarded for levels that are solved half of the time.
 
-A reward is a function of one training step of K Solvers that gives each of them a number. This one
-is learnability, p (1 - p) with p the success rate on a level (Rutherford et al. 2024, "No Regrets",
-sections 3 and 4). In Python, at a scale of seconds:
+A reward is a function from one training step of K Solvers to a number for each. This one is
+learnability, p (1 - p), where p is the success rate on a level (Rutherford et al. 2024, "No
+Regrets", sections 3 and 4). In Python, in seconds:
 
     python examples/own_reward.py [updates]
 
-On the command line, named in a method of your own (examples/conf/method/own_reward.yaml):
+On the command line, by a method that names it (examples/conf/method/own_reward.yaml):
 
     PYTHONPATH=examples bin/train --config-dir examples/conf +method=own_reward +scale=quick
 """
@@ -23,9 +23,9 @@ from proposer_rl.methods import Components, proposer
 
 
 def learnability(step: TrainingStep) -> Tensor:
-    """Mean of p (1 - p) over the levels just trained on, float [K].
+    """Return the mean of p (1 - p) over the levels just trained on, float [K].
 
-    p is the share of a level's episodes that reached the goal, of those that ended in the rollout.
+    p is the share of a level's episodes ending in the rollout that reached the goal.
     """
     ends = step.rollout["next"].select("terminated", "done")
     reached, ended = (ends[key].float().sum((-2, -1)) for key in ("terminated", "done"))  # [K, P]

@@ -1,14 +1,14 @@
-"""A Solver's network of your own: one convolution, applied again and again.
+"""Write your own network for the Solver: one convolution that is applied several times.
 
-Any module without buffers will do that maps planes [*B, 3, H, W] to action logits [*B, 4, H, W] and
-values [*B, 1, H, W]. Like value iteration, this one carries news of the goal one cell further with
-every application of the same weights (Tamar et al. 2016, "Value Iteration Networks"). Afterwards it
-acts in mazes larger than those it was trained on.
+Any module without buffers can be used that maps planes [*B, 3, H, W] to action logits
+[*B, 4, H, W] and values [*B, 1, H, W]. Like value iteration, this one passes the goal's value one
+cell further with every application of the same weights (Tamar et al. 2016, "Value Iteration
+Networks"), so that it can also act in larger mazes than those it was trained on.
 
     python examples/own_solver.py [updates]
 
-The command line has the U-Net's sizes; there, another network is a task of your own: a function
-with MazeTask's arguments that passes `make_network` to it, named as `task._target_`.
+To use it on the command line, write a function with MazeTask's arguments that passes on
+`make_network`, and name it as `task._target_`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from proposer_rl.tasks.mazes import planes
 
 
 class Iterated(nn.Module):
-    """A 3x3 convolution that is applied ``steps`` times, each time beside the maze."""
+    """Applies a 3x3 convolution ``steps`` times, each time adding features of the maze."""
 
     def __init__(self, width: int = 24, steps: int = 8) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ class Iterated(nn.Module):
 
 
 def main(updates: int = 100) -> None:
-    """Train it on 5x5 mazes, and measure it on 8x8 ones."""
+    """Train on 5x5 mazes, and evaluate on 8x8 mazes."""
     task = small_task(Iterated)
     learner = task.learner([Streams(0, "solver")])
     report(train(task, SamplingCurriculum(task.target), updates, learner))

@@ -1,9 +1,9 @@
-"""A whole task in forty lines: stop a sledge at a place, on ice, against the wind.
+"""Write a whole task in forty lines: stop a sledge on ice at a given place, against the wind.
 
     PYTHONPATH=examples bin/train --config-dir examples/conf task=own_task +method=currot
 
-trains, and what it wrote is watched (bin/watch), reported (bin/report) and evaluated (bin/eval) as
-any other run. `proposer_rl/task/base.py` has all that can be replaced; a picture, say.
+trains on it. Then use bin/watch, bin/report and bin/eval as for any other run. Further methods that
+a task may define, such as pictures of levels, are in `proposer_rl/task/base.py`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from proposer_rl.tasks.parameters import ParameterSpace, intervals, points
 
 
 class Sledges(EnvBase):
-    """A batch of sledges that are pushed back, not at all, or forth."""
+    """A batch of sledges, which actions push back, not at all, or forth."""
 
     def __init__(self, levels: TensorDictBase) -> None:
         super().__init__(batch_size=(batch := levels.batch_size))
@@ -50,7 +50,7 @@ class Sledges(EnvBase):
 
 
 class Network(nn.Module):
-    """Logits of three actions, and a value."""
+    """A network from observations to logits of three actions and a value."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -61,7 +61,7 @@ class Network(nn.Module):
 
 
 class SledgeTask(Task):
-    """Distances and winds, of which far ones against a strong wind are the target."""
+    """A task of distances and winds; the target is large distances against a strong wind."""
 
     title, noun, batched = "sledges", "sledges", True
 

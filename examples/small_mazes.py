@@ -1,4 +1,4 @@
-"""What the examples on mazes share: a task that is trained on in seconds, and the outer loop."""
+"""Helpers of the examples on mazes: a task that trains in seconds, and a run."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ CYCLE = 10  # updates between two improvements of a curriculum
 
 
 def small_task(network: Callable[[], nn.Module] | None = None) -> MazeTask:
-    """5x5 mazes: the target has 5 obstacles and paths of 4 moves."""
+    """Make a task of 5x5 mazes; the target has 5 obstacles and paths of 4 moves."""
     ppo = PPOSettings(horizon=10, learning_rate=2e-3)
     return MazeTask(
         maze=MazeSettings(height=5, width=5, max_steps=10),
@@ -52,7 +52,7 @@ def small_task(network: Callable[[], nn.Module] | None = None) -> MazeTask:
 
 
 def proposer_settings() -> ProposerSettings:
-    """A Proposer that learns from four replicas of the Solver, trained for a cycle."""
+    """Return settings of a Proposer that learns from four replicas of the Solver."""
     return ProposerSettings(
         rollouts=4,
         meta_episode_length=CYCLE,
@@ -66,7 +66,7 @@ def proposer_settings() -> ProposerSettings:
 def train(
     task: MazeTask, curriculum: Curriculum, updates: int, learner: PPO | None = None
 ) -> list[dict[str, Any]]:
-    """Train a Solver, a fresh one unless given; a row of measurements for every ten updates."""
+    """Train a Solver, new unless given; return a row of measurements for every ten updates."""
     with TemporaryDirectory() as folder:
         experiment = Experiment(
             task,

@@ -1,7 +1,7 @@
-"""MazeEnv in an ordinary TorchRL script: Collector, GAE and ClipPPOLoss, no learner of ours.
+"""Train on mazes by an ordinary TorchRL script: Collector, GAE and ClipPPOLoss.
 
-The environment draws the agent on a plane of its observation, so that any network for pictures will
-do, one forward pass per step. Fresh levels are set before every batch.
+The environment draws the agent on a plane of its observation, so that any network for images can be
+used. New levels are set before every batch.
 
     python examples/stock_ppo.py [iterations]
 """
@@ -26,12 +26,12 @@ MAZES, STEPS, EPOCHS, MINIBATCH = 64, 20, 4, 320
 
 
 def levels() -> Level:
-    """5x5 mazes with 5 obstacles and a shortest path of 4 moves."""
+    """Draw 5x5 mazes with 5 obstacles and a shortest path of 4 moves."""
     return generate_levels([0.2] * MAZES, 4, height=5, width=5)
 
 
 def network(outputs: int) -> nn.Module:
-    """From planes [*B, 4, 5, 5] to numbers [*B, outputs]."""
+    """Make a network from planes [*B, 4, 5, 5] to numbers [*B, outputs]."""
     convolutions = ConvNet(
         4, num_cells=[16, 32], kernel_sizes=3, paddings=1, activation_class=nn.ReLU
     )

@@ -1,4 +1,4 @@
-"""A curriculum for DQN, off policy: a level per episode, a replay buffer of transitions.
+"""Use a curriculum with DQN: one level for each episode, and a replay buffer of transitions.
 
 python examples/taught_dqn.py [episodes]
 """
@@ -17,12 +17,12 @@ import proposer_rl as prl
 
 
 def main(episodes: int = 200) -> None:
-    """Train on gravities whose returns change; print the return of each twentieth episode."""
+    """Train on gravities chosen by prioritised replay; print every twentieth return."""
     torch.manual_seed(0)
     random.seed(0)
     env = gymnasium.make("CartPole-v1")
     space = prl.Parameters({"gravity": (5.0, 25.0)})
-    teacher = prl.Teacher(prl.curricula.plr(capacity=64, fill=0.25), space, block=16)
+    teacher = prl.Teacher(prl.curricula.plr(capacity=64, fill=0.25), space)
     network, old = (nn.Sequential(nn.Linear(4, 64), nn.ReLU(), nn.Linear(64, 2)) for _ in range(2))
     optimiser = torch.optim.Adam(network.parameters(), 1e-3)
     memory: deque = deque(maxlen=20_000)

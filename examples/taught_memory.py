@@ -1,4 +1,4 @@
-"""ACCEL, a buffer of mazes and their edits, around an LSTM agent of one's own.
+"""Train your own LSTM agent with ACCEL, which edits replayed mazes.
 
 python examples/taught_memory.py [updates]
 """
@@ -20,11 +20,11 @@ MAZES, STEPS = 32, 24
 
 
 def main(updates: int = 200) -> None:
-    """Train; print returns, and how much the mazes of the buffer were edited."""
+    """Train; print returns, and the number of edits of the mazes in the buffer."""
     torch.manual_seed(0)
     fresh = lambda n, g: scattered_walls(torch.zeros(n).long(), 7, 7, g)  # noqa: E731
     env = ViewMazeEnv(fresh(MAZES, torch.Generator()), max_steps=STEPS)
-    memory, heads = nn.LSTMCell(29, 32), nn.Linear(32, 3 + 1)  # of three actions, and a value
+    memory, heads = nn.LSTMCell(29, 32), nn.Linear(32, 3 + 1)  # three actions and a value
 
     def play(levels: Any) -> tuple[Tensor, Tensor, Tensor]:
         env.set_levels(levels)

@@ -1,6 +1,6 @@
-"""A curriculum of terrains for thousands of robots at once, with partial resets, on one device.
+"""Choose terrains for thousands of robots at once, on one device, with partial resets.
 
-The simulator is a stand-in for those of robots: batched tensors, ``reset_idx(env_ids)``.
+A few tensors stand in for a simulator of robots: it has batches and ``reset_idx(env_ids)``.
 
     python examples/taught_robots.py [steps]
 """
@@ -19,7 +19,7 @@ DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
 
 class Walkers:
-    """Points that walk, slower uphill, and fall where it is too rough."""
+    """Simulate points that walk, slower uphill, and fall where it is too rough."""
 
     def __init__(self) -> None:
         self.place, self.steps = torch.zeros(2, ENVS, device=DEVICE)
@@ -31,13 +31,13 @@ class Walkers:
 
     def step(self) -> None:
         fell = torch.rand(ENVS, device=DEVICE) < 0.3 * (self.terrain["roughness"] - self.skill)
-        self.place += 1 - self.terrain["slope"].float()
+        self.place += 1 - self.terrain["slope"]
         self.steps += 1
         self.skill = min(1.0, self.skill + 0.002 * float((~fell).float().mean()))
         self.reset_idx((fell | (self.steps >= LIMIT)).nonzero().squeeze(1))
 
     def reset_idx(self, env_ids: Tensor) -> None:
-        """Tell how far these came, and ask for their next terrain."""
+        """Tell the teacher how far these robots came, and ask for their next terrain."""
         walked = self.steps[env_ids] >= LIMIT
         self.teacher.tell(self.ids[env_ids], return_=self.place[env_ids], success=walked)
         self.ids[env_ids], self.terrain[env_ids] = self.teacher.ask(len(env_ids))
@@ -45,7 +45,7 @@ class Walkers:
 
 
 def main(steps: int = 300) -> float:
-    """Walk; print how rough the terrain is."""
+    """Walk; print the roughness of the terrain."""
     robots = Walkers()
     for step in range(steps):
         robots.step()

@@ -1,4 +1,4 @@
-"""A curriculum in Stable-Baselines3: CartPole of many gravities in eight environments.
+"""Use a curriculum with Stable-Baselines3: CartPole with many gravities, eight at a time.
 
 python examples/taught_sb3.py [steps]
 """
@@ -21,21 +21,21 @@ SPACE = prl.Parameters({"gravity": (5.0, 25.0), "length": (0.3, 1.0)})
 
 
 def set_level(env: Any, level: Any) -> None:
-    """CartPole computes more of its length once; that is set, too."""
+    """Set a level; ``set_length`` also sets the numbers that CartPole derives from the length."""
     env.gravity = level["gravity"]
     set_length(env, level["length"])
 
 
 def main(steps: int = 20_000) -> PPO:
-    """Train; the log has the curriculum's numbers as ``teacher/NAME``."""
-    teacher = prl.Teacher(prl.curricula.learning_progress(source="episodes"), SPACE, block=16)
+    """Train; the log has the teacher's numbers as ``teacher/NAME``."""
+    teacher = prl.Teacher(prl.curricula.learning_progress(source="episodes"), SPACE)
 
     def make() -> gymnasium.Env:
         env = prl.TaughtEnv(
             gymnasium.make("CartPole-v1"),
             teacher,
             set_level,
-            success="truncated",  # it survived
+            success="truncated",  # the pole stood until the time limit
         )
         return Monitor(env)
 

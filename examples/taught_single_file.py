@@ -1,4 +1,4 @@
-"""A curriculum in a single-file script of the kind of CleanRL: vector environments, advantages.
+"""Use a curriculum in a single-file script like CleanRL's, with vector environments.
 
 python examples/taught_single_file.py [iterations]
 """
@@ -17,10 +17,10 @@ ENVS, STEPS, GAMMA = 8, 64, 0.99
 
 
 def main(iterations: int = 60) -> None:
-    """Train with a policy gradient and a critic; print how long episodes are."""
+    """Train with a policy gradient and a critic; print the length of episodes."""
     torch.manual_seed(0)
     space = prl.Parameters({"gravity": (5.0, 25.0), "force_mag": [5.0, 10.0, 15.0]})
-    teacher = prl.Teacher(prl.curricula.alp_gmm(warmup=64, refit=64), space, block=16)
+    teacher = prl.Teacher(prl.curricula.alp_gmm(warmup=64, refit=64), space)
     sets = {"gravity": "gravity", "force_mag": "force_mag"}
     envs = gymnasium.vector.SyncVectorEnv(
         [lambda: prl.TaughtEnv(gymnasium.make("CartPole-v1"), teacher, sets)] * ENVS,

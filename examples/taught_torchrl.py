@@ -1,4 +1,4 @@
-"""A curriculum in TorchRL's PPO loop: prioritised replay of gravities, marked with "teacher".
+"""Use a curriculum in TorchRL's PPO loop: two places, marked "teacher", replay gravities.
 
 python examples/taught_torchrl.py [iterations]
 """
@@ -21,12 +21,12 @@ import proposer_rl as prl
 
 
 def set_gravity(env: Any, level: Any) -> None:
-    """Teacher: how a level gets into the environment."""
+    """Set a level in the environment (teacher)."""
     env.unwrapped.gravity = float(level["gravity"])
 
 
 def main(iterations: int = 40) -> None:
-    """Train; print the return of the episodes that have ended."""
+    """Train; print the mean length of episodes."""
     torch.manual_seed(0)
     teacher = prl.Teacher(prl.curricula.plr(capacity=200), prl.Parameters({"gravity": (5.0, 25.0)}))
     env = TransformedEnv(  # teacher

@@ -274,7 +274,8 @@ def explained(error: Exception) -> str:
     cause: Any = error.__cause__
     holder = getattr(cause, "parent_node", None)
     if isinstance(cause, AttributeError | KeyError) and isinstance(holder, Mapping):
-        return unknown(cause.full_key, sorted({*holder} - {"hydra"}))
+        key = getattr(cause, "full_key", None)
+        return unknown(str(key), sorted({*holder} - {"hydra"}))
     said = getattr(error, "override", None), error, cause
     return ": ".join(" ".join(str(each).split()) for each in said if each)
 

@@ -1,4 +1,4 @@
-"""Named random streams: every draw's generator is a function of the seed and of what it is for."""
+"""Named random streams: the generator of a draw depends only on the seed and on its purpose."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from threading import RLock
 
 import torch
 
-DEFAULT = RLock()  # torch's default generator is one for all threads
+DEFAULT = RLock()  # all threads share torch's default generator
 
 
 class Streams:
-    """Random generators addressed by name instead of by order of use.
+    """Makes random generators by name, independent of the order of use.
 
-    A generator's state depends only on the seed and its key, such as ``("actions", step, copy)``.
-    So nothing has to be saved to resume a run, a new consumer of random numbers changes no other,
-    and replicas draw the same numbers wherever and in whatever company they run.
+    The state of a generator depends on the seed and a key alone, such as ``("actions", step, k)``.
+    So a run can be resumed without saving generators, a new use of random numbers does not change
+    the others, and replicas draw the same numbers wherever they run.
 
     Args:
         seed: the run's seed.
-        scope: keys put before every generator's own.
+        scope: keys that precede the key of every generator.
 
     Example:
         >>> streams = Streams(7)
@@ -38,28 +38,28 @@ class Streams:
 
     @property
     def address(self) -> list[str | int]:
-        """Seed and scope: ``Streams(*address)`` are the same streams."""
+        """Seed and scope; ``Streams(*address)`` makes the same streams."""
         return [self._seed, *self._scope]
 
     def within(self, *scope: str | int) -> Streams:
-        """Returns the streams below a further scope."""
+        """Returns streams with a longer scope."""
         return Streams(self._seed, *self._scope, *scope)
 
     def generator(self, *key: str | int) -> torch.Generator:
         """Returns a new CPU generator for ``key``; equal keys give equal states.
 
-        Numbers are drawn there for every device: generators of other devices draw others.
+        Draw on the CPU for every device: generators of other devices draw other numbers.
         """
         return torch.Generator().manual_seed(self._seed_of(*key))
 
     @contextmanager
     def as_default(self, *key: str | int) -> Iterator[None]:
-        """Lets torch's default CPU generator draw from ``key`` inside the context only.
+        """Lets torch's default CPU generator draw from ``key`` within the context.
 
         For code that takes no generator, such as the initialisation of layers.
         """
         with DEFAULT, torch.random.fork_rng(devices=[]):
-            # torch.manual_seed would seed the generators of GPUs, too.
+            # torch.manual_seed would also seed the generators of GPUs.
             torch.default_generator.manual_seed(self._seed_of(*key))
             yield
 
@@ -70,5 +70,5 @@ class Streams:
 
 
 def _own(key: str | int) -> str | int:
-    """Returns a key as Python's own, since NumPy's has another representation."""
+    """Converts a key to a Python type, because NumPy's types have other representations."""
     return str(key) if isinstance(key, str) else index(key)

@@ -1,9 +1,9 @@
-"""An environment that holds what pip installs of a wheel, and nothing of the tests' tools.
+"""Commands of a wheel where nothing can be imported but what it requires.
 
-It is made offline and in a second: the wheel is unpacked, and of what it requires, as installed
-here, the files are linked; what an extra requires besides, in a folder of its own. Run as a program
-in such an environment, this file imports what commands need, which takes seconds, and then calls
-commands in forks of itself: each of its lines names an extra, the extra's folder and where to work.
+Run as a program, with the folder that the wheel is unpacked in, this file hides all packages that
+are installed here and that neither the wheel nor one of its extras requires, as if they were not.
+It imports what commands need, which takes seconds, and then calls commands in forks of itself: each
+of its lines names an extra and where to work.
 """
 
 from __future__ import annotations
@@ -15,45 +15,17 @@ import os
 import shutil
 import subprocess
 import sys
-import sysconfig
 import traceback
-import venv
-import zipfile
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import redirect_stdout
 from functools import cache
 from importlib import metadata
-from importlib.util import module_from_spec, spec_from_file_location
+from importlib.machinery import ModuleSpec, PathFinder
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from threading import Thread
 from typing import Any
-
-
-def make_environment(folder: Path, wheel: Path, extras: list[str]) -> dict[str, Path]:
-    """Make a virtual environment of a wheel and what it requires.
-
-    Args:
-        folder: where it goes.
-        wheel: of this project.
-        extras: of this project; the empty one is none.
-
-    Returns:
-        Of each extra the folder with all that is installed without it, or with what it adds.
-    """
-    venv.create(folder, with_pip=False, symlinks=True)
-    (site,) = folder.glob("lib/python*/site-packages")
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(site)
-    (project,) = metadata.distributions(path=[str(site)])
-    always = closure(project, "")
-    sites = {}
-    for extra in extras:
-        sites[extra] = folder / extra if extra else site
-        sites[extra].mkdir(exist_ok=True)
-        names = closure(project, extra) - always if extra else always
-        _link({name: metadata.distribution(name) for name in names}, sites[extra])
-    return sites
 
 
 def interpreter(version: str) -> str | None:
@@ -73,16 +45,6 @@ def pip(folder: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str
         [folder / "bin" / "python", "-m", "pip", "--disable-pip-version-check", *arguments],
         cwd=folder, capture_output=True, text=True, check=False,
     )  # fmt: skip
-
-
-def share_bytecode(prefix: str, sites: Iterable[Path]) -> None:
-    """Let environments find the linked files compiled that this one keeps below a folder."""
-    ours = Path(prefix + sysconfig.get_path("purelib"))
-    ours.mkdir(parents=True, exist_ok=True)
-    for site in sites:
-        place = Path(prefix + str(site))
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.symlink_to(ours)
 
 
 def closure(project: metadata.Distribution, extra: str) -> set[str]:
@@ -126,21 +88,26 @@ def installed() -> tuple[dict[str, list[str]], dict[str, set[str]]]:
     return files, owners
 
 
-def _link(required: dict[str, metadata.Distribution], site: Path) -> None:
-    """Link whole folders that are only theirs, and file by file those that others write into."""
-    files, owners = installed()
-    for name, distribution in required.items():
-        assert files[name], f"{name} is installed without a list of its files"
-        places = {
-            file if owners[top] - required.keys() else top
-            for file in files[name]
-            if (top := file.split("/")[0]) not in ("..", "__pycache__")
-            and not file.endswith((".pth", ".pyc"))
-        }
-        for place in places:
-            if not (site / place).exists():
-                (site / place).parent.mkdir(parents=True, exist_ok=True)
-                (site / place).symlink_to(Path(str(distribution.locate_file(place))))
+class Required(PathFinder):
+    """Finds what is required, and nothing else that is installed."""
+
+    hidden: frozenset[str] = frozenset()
+
+    @classmethod
+    def find_spec(cls, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        """As of any path, but for what is hidden."""
+        hidden = path is None and fullname in cls.hidden
+        return None if hidden else super().find_spec(fullname, path, target)
+
+    @classmethod
+    def only(cls, required: set[str]) -> None:
+        """Hide what belongs to none of these distributions."""
+        _, owners = installed()
+        cls.hidden = frozenset(
+            top.removesuffix(".py")
+            for top in owners
+            if not owners[top] & {"proposer-rl", *required}
+        )
 
 
 RUN = "runs"
@@ -278,20 +245,30 @@ def _end_with(function: Callable[..., None], *given: Any) -> None:
     os._exit(code)
 
 
-def _main() -> None:
+def _main(site: str) -> None:
     gc.disable()  # of what is imported nothing is garbage
+    (project,) = metadata.distributions(path=[site])
+    required = {extra: closure(project, extra) for extra in json.loads(sys.argv[2])}
+    # A checkout that is installed here in place is a folder of its own.
+    sys.path[:] = [
+        site,
+        *(one for one in sys.path if one.startswith((sys.prefix, sys.base_prefix))),
+    ]
+    sys.meta_path[sys.meta_path.index(PathFinder)] = Required
+    Required.only(required[""])
     # Of the tests' folder nothing else can be imported.
     spec = spec_from_file_location("composing", Path(__file__).with_name("composing.py"))
     assert spec is not None and spec.loader is not None
     spec.loader.exec_module(composing := module_from_spec(spec))
     composing.remember()
-    from proposer_rl.cli import run  # noqa: F401  what takes seconds, before the forks
+    from proposer_rl.cli import run  # takes seconds, before the forks
 
+    assert run.__file__.startswith(site) and find_spec("pytest") is None
     assert "gymnasium" not in sys.modules  # which looks for an extra's environments at once
     gc.freeze()  # a child that looks for garbage would copy all that memory
     gc.enable()
     for line in sys.stdin:
-        extra, site, folder = json.loads(line)
+        extra, folder = json.loads(line)
         child = os.fork()
         if child == 0:
             os.chdir(folder)
@@ -299,11 +276,10 @@ def _main() -> None:
             os.dup2(output, 1)
             os.dup2(output, 2)
             faulthandler.dump_traceback_later(LONGEST, exit=True, file=2)
-            if extra:
-                sys.path.append(site)
+            Required.only(required[extra])
             _end_with(_run, extra)
         print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 
 
 if __name__ == "__main__":
-    _main()
+    _main(sys.argv[1])

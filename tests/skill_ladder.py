@@ -150,11 +150,3 @@ def best_constant(skills: int, updates: int, problems: int) -> float:
     for _ in range(updates):
         state = train(state, shares)
     return float(state[:, -1].max())
-
-
-def even(skills: int, updates: int, choices: int) -> float:
-    """The same for the even mixture of all kinds, which is what a Proposer begins with."""
-    state = torch.zeros(skills)
-    for _ in range(updates):
-        state = train(state, torch.full((skills,), 1 / choices))
-    return float(state[-1])

@@ -7,7 +7,7 @@ import pickle
 import shutil
 import sys
 import warnings
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from proposer_rl.cli.build import Made, build, parts
+from proposer_rl.cli.build import parts
 from proposer_rl.cli.config import read_config, saved_config
 from proposer_rl.cli.errors import (
     BAD_INPUT,
@@ -28,11 +28,11 @@ from proposer_rl.cli.errors import (
     one_line,
 )
 from proposer_rl.cli.groups import arranged
-from proposer_rl.cli.run import check_same_run
 from proposer_rl.extras import install_command
 from proposer_rl.recipes import CONFIG_FOLDER
-from proposer_rl.runs.folder import RunFolder
-from proposer_rl.runs.process import Interrupted, StopSignals
+from proposer_rl.runs.folder import TABLES
+from proposer_rl.runs.process import StopSignals
+from tests.commands import trained_run
 from tests.same_run import assert_same_run
 from tests.tiny import composed
 
@@ -86,6 +86,8 @@ WRONG_COMMANDS = [
     (["+method=target", "logger=paper"], "logger/paper: unknown; there are: csv,"),
     (["+method=target", "sede=1"], "sede: unknown; there are: ablation, checkpoint, compute,"),
     (["+method=target", "seed"], "Error parsing override 'seed' missing EQUAL"),
+    (["+method=target", "task.network=[1,2"], "error: task.network=[1,2: "),
+    (["+method=target", "hydra.run.dir=runs/é"], "error: hydra.run.dir=runs/é: "),
     (["+method=target", "seeds=[1,1]"], "seeds=[1, 1]: must be distinct"),
     (["task=cartpole", "+method=target", "+scale=medium"], "scale=medium: is a scale of task=maze"),
     ([], f"method: missing; choose one with +method=NAME, NAME one of: {METHODS}"),
@@ -112,7 +114,7 @@ WRONG_COMMANDS = [
     ),
     (
         ["task=cartpole", "+method=target", "+filter=learnability"],
-        "method=target needs a student with exact_performance: GymnasiumTask tells performance by",
+        "method=target needs a student with exact_performance: GymnasiumTask measures",
     ),
     (
         ["+method=perf_gain", *SMOKE, "proposer.action_repeat=2"],
@@ -123,6 +125,18 @@ WRONG_COMMANDS = [
         "curriculum.reward: unknown; there are: checkpoint",
     ),
     (["+method=target", "compute.collector=ray"], "compute.collector=ray: this method trains no"),
+    (
+        ["+method=frozen_proposer", *SMOKE],
+        "curriculum.checkpoint=None: must name a run's folder or a checkpoint that has a Proposer",
+    ),
+    (
+        ["+method=frozen_proposer", *SMOKE, "checkpoint=nowhere"],
+        "curriculum.checkpoint=nowhere: cannot read nowhere: No such file or directory",
+    ),
+    (
+        ["+method=frozen_proposer", *SMOKE, "checkpoint=."],
+        "curriculum.checkpoint=.: the folder holds no checkpoints and no proposer.pt",
+    ),
 ]
 
 
@@ -231,7 +245,7 @@ def test_a_value_may_refer_to_another(train) -> None:
     assert train(*arguments, "hydra.run.dir=run") == 0
     found = json.loads(Path("run/run.json").read_text())
     assert found["planned_updates"] == 1
-    assert found["overrides"] == [word.lstrip("+") for word in arguments]
+    assert found["overrides"] == arguments
 
 
 def test_without_ray_its_collector_is_refused(train, capsys, monkeypatch) -> None:
@@ -243,95 +257,72 @@ def test_without_ray_its_collector_is_refused(train, capsys, monkeypatch) -> Non
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run's folder, without the run: its settings, and a checkpoint of its first state."""
-    folder = RunFolder(tmp_path_factory.mktemp("finished"))
-    config = composed("+method=target", *SMOKE)
-    made = parts(config, StopSignals())
-    check_same_run(folder, replace(config, precision=made.task.precision))
-    experiment = build(config, made, folder, signals=At.once())
-    with pytest.raises(Interrupted):
-        experiment.run()
-    return folder.path
-
-
-@pytest.fixture(scope="module")
-def made() -> Made:
-    """What a run of these settings is made of; none is trained."""
-    return parts(composed("+method=target", *SMOKE), StopSignals())
-
-
-class At(StopSignals):
-    """A signal that has come before the run has begun."""
-
-    @classmethod
-    def once(cls) -> At:
-        signals = cls()
-        signals._before[15], signals._pending = None, 15
-        return signals
-
-
-def copy_of(folder: Path, name: str = "run") -> Path:
-    return Path(shutil.copytree(folder, name))
+    """A run of two updates."""
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    return trained_run(folder, "+method=target", *SMOKE, "schedule.updates=2")
 
 
 def refused(train, capsys, *arguments: str) -> str:
     """The line that a resumed run is refused with; nothing is changed by it."""
-    kept = {p.name: p.read_bytes() for p in Path("run").glob("*.*") if p.is_file()}
+    files = [Path("run", name) for name in ("config.json", *TABLES)]
+    kept = {file: file.read_bytes() for file in files if file.exists()}
     assert train("+method=target", *SMOKE, "hydra.run.dir=run", *arguments) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
-    kept.pop("train.log", None)
-    assert {name: (Path("run") / name).read_bytes() for name in kept} == kept
+    assert {file: file.read_bytes() for file in kept} == kept
     return line
 
 
-def test_a_resumed_run_with_other_settings_is_refused(finished: Path, train, capsys) -> None:
-    copy_of(finished)
-    line = refused(train, capsys, "solver.ppo.gamma=0.5", "task.maze.max_steps=9")
-    assert (
-        line.startswith("error: solver.ppo.gamma=0.5: the run in ") and "started with 0.99" in line
-    )
-    assert line.endswith("differing keys: solver.ppo.gamma, task.maze.max_steps")
+def stored(change: Callable[[dict[str, Any]], Any]) -> Callable[[bytes], bytes]:
+    """Changes what a run has stored of its configuration."""
+
+    def changed(content: bytes) -> bytes:
+        change(config := json.loads(content))
+        return json.dumps(config).encode()
+
+    return changed
 
 
-def test_a_run_of_an_earlier_version_does_not_go_on(finished: Path, train, capsys) -> None:
-    file = copy_of(finished) / "config.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), "lifetimes": 1}))
-    with pytest.raises(ConfigError, match=r"of this version: lifetimes: unknown") as read:
-        saved_config(Path("run"))
-    assert exit_code(read.value) == BAD_INPUT and "\n" not in str(read.value)
-    assert "lifetimes=None: the run in " in refused(train, capsys)
+CHANGED: list[tuple[str, Callable[[bytes], bytes], list[str], str]] = [
+    (
+        *("config.json", bytes, ["solver.ppo.gamma=0.5", "task.maze.max_steps=9"]),
+        "started with 0.99; differing keys: solver.ppo.gamma, task.maze.max_steps",
+    ),
+    ("config.json", stored(lambda c: c.update(lifetimes=1)), [], "lifetimes=None: the run in "),
+    (
+        "config.json",
+        stored(lambda config: config["task"]["network"].update(channels=[8, 8])),
+        ["task.network.channels=[8,8]"],
+        "does not fit this run: the snapshot belongs to",
+    ),
+    ("config.json", lambda _: b"{", [], "config.json: Expecting property name"),
+    ("config.json", lambda _: b"[1]", [], "started with [1]"),
+    ("metrics.csv", lambda _: b"seed\n", [], "metrics.csv has 0 rows, fewer than the 2 to be kept"),
+]
 
 
-def test_a_checkpoint_of_another_architecture_is_refused(finished: Path, train, capsys) -> None:
-    folder = copy_of(finished)
-    (folder / "config.json").unlink()
-    config = json.loads((finished / "config.json").read_text())
-    config["task"]["network"]["channels"] = [8, 8]
-    (folder / "config.json").write_text(json.dumps(config))
-    line = refused(train, capsys, "task.network.channels=[8,8]")
-    assert "checkpoint 1 in " in line and "does not fit this run: the snapshot belongs to" in line
-
-
-def test_a_table_that_was_shortened_is_refused(finished: Path, train, capsys) -> None:
-    folder = copy_of(finished)
-    (folder / "metrics.csv").write_text("seed\n")
-    assert "metrics.csv has 0 rows, fewer than the 1 to be kept" in refused(train, capsys)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [(b"{", "config.json: Expecting property name"), (b"[1]", "started with [1]")],
-)
-def test_a_stored_configuration_that_is_none_is_refused(
-    content: bytes, message: str, finished: Path, train, capsys
+@pytest.mark.parametrize(("file", "change", "arguments", "message"), CHANGED)
+def test_a_run_that_is_another_is_not_resumed(
+    file: str,
+    change: Callable[[bytes], bytes],
+    arguments: list[str],
+    message: str,
+    finished: Path,
+    train,
+    capsys,
 ) -> None:
-    (copy_of(finished) / "config.json").write_bytes(content)
-    assert message in refused(train, capsys)
+    shutil.copytree(finished, "run")
+    (Path("run") / "summary.json").unlink()
+    path = Path("run", file)
+    path.write_bytes(change(path.read_bytes()))
+    assert message in refused(train, capsys, *arguments)
+    if "lifetimes" in message:
+        with pytest.raises(ConfigError, match=r"of this version: lifetimes: unknown"):
+            saved_config(Path("run"))
 
 
 def test_a_stored_configuration_instantiates_nothing(finished: Path, train, capsys) -> None:
     """Neither the one that is compared, nor Hydra's own copies, which nobody reads."""
-    folder = copy_of(finished)
+    folder = Path(shutil.copytree(finished, "run"))
     evil = {"_target_": "os.mkdir", "path": str(Path("executed").resolve())}
     stored = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps({**stored, "curriculum": evil}))
@@ -343,8 +334,7 @@ def test_a_stored_configuration_instantiates_nothing(finished: Path, train, caps
     assert "curriculum._target_='proposer_rl.methods.target': the run in" in refused(train, capsys)
     assert not Path("executed").exists()
     (folder / "config.json").write_text(json.dumps(stored))
-    few = "schedule.updates=1"
-    assert train("+method=target", *SMOKE, few, "hydra.run.dir=run") == 0
+    assert train("+method=target", *SMOKE, "hydra.run.dir=run") == 0
     assert not Path("executed").exists()
 
 
@@ -356,9 +346,9 @@ def test_a_folder_with_tables_of_something_else_is_left_alone(train, capsys) -> 
 
 
 def test_what_may_differ_in_a_resumed_run(finished: Path, train) -> None:
-    folder = copy_of(finished)
+    folder = Path(shutil.copytree(finished, "run"))
     free = ["schedule.checkpoint_seconds=null", "schedule.keep_checkpoints=3", "compute.cores=1"]
-    few = [*SMOKE, "schedule.updates=2"]
+    few = [*SMOKE, "schedule.updates=4"]
     assert train("+method=target", *few, "hydra.run.dir=run", *free) == 0
     assert train("+method=target", *few, "hydra.run.dir=whole") == 0
     assert_same_run(Path("whole"), folder)

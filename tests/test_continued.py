@@ -18,7 +18,6 @@ from proposer_rl.curricula.contract import outcome_of_episodes
 from proposer_rl.experiment.continued import ContinuedLevels
 from proposer_rl.experiment.loop import SideBySide
 from proposer_rl.learning import PPOSettings, RolloutCollector, SolverSettings
-from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.batched_env import plays
 from proposer_rl.tasks.gymnasium.environment import SuccessSettings
@@ -26,7 +25,7 @@ from proposer_rl.tasks.gymnasium.player import LevelPlayer
 from tests.same_run import assert_same_run
 from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, walk_task
 from tests.test_experiment import experiment
-from tests.tiny import tiny_task, tiny_view_task
+from tests.tiny import tiny_view_task
 
 K, P, T = 2, 3, 4
 SEEDS = list(range(K))
@@ -162,13 +161,6 @@ def test_a_memory_goes_on_with_its_episode() -> None:
         torch.testing.assert_close(found[key], expected[key])
 
 
-def test_whoever_reads_a_level_once_cannot_go_on() -> None:
-    ppo = PPOSettings(horizon=T, continue_episodes=True)
-    task = tiny_task(solver=SolverSettings(batch_size=P, ppo=ppo))
-    with pytest.raises(ArgumentError, match=r"^continue_episodes=True: this Solver reads its"):
-        task.learner([Streams(0)])
-
-
 def test_others_watch_whole_episodes_elsewhere() -> None:
     """What a score plays leaves the episodes of the training where they are."""
     learner = TASK.learner([Streams(seed) for seed in SEEDS])
@@ -183,8 +175,7 @@ def test_others_watch_whole_episodes_elsewhere() -> None:
     after = learner.collect(generators)
     going_on = ~before["next", "done"][:, :, -1, 0]
     assert torch.equal(
-        after["observation"][:, :, 0][going_on],
-        before["next", "observation"][:, :, -1][going_on],
+        after["observation"][:, :, 0][going_on], before["next", "observation"][:, :, -1][going_on]
     )
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib.util
 import json
+import operator
 import re
 import shlex
 import sys
@@ -15,11 +17,13 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
 import proposer_rl as prl
 from proposer_rl.cli.eval import main as evaluate
 from proposer_rl.cli.groups import arranged
-from proposer_rl.recipes import CONFIG_FOLDER, maker
+from proposer_rl.cli.help import needs
+from proposer_rl.recipes import CONFIG_FOLDER, composed, maker
 from proposer_rl.settings import check_names, schema
 from tests.commands import SMOKE, call, trained_run
 from tests.committed import needs_results
@@ -31,6 +35,8 @@ PAGES = {
     for file in sorted(DOCS.rglob("*.md"))
     if file.parts[len(DOCS.parts)] != "api"
 }
+# A block of code, and its output if a block without a language follows.
+OUTPUT = r"^```python\n(.*?)^```$(?:\n\n^```\n(.*?)^```$)?"
 CONFIGURATION, LEVELS = PAGES["reference/configuration"], PAGES["how_to/levels"]
 
 
@@ -57,16 +63,19 @@ OTHERS = sorted({(program, words) for program, words in shown() if program != "t
 
 @pytest.mark.usefixtures("own_folder")
 @pytest.mark.parametrize("page", [page for page, text in PAGES.items() if blocks("python", text)])
-def test_the_code_runs(page: str) -> None:
+def test_the_code_runs_and_says_what_is_shown(
+    page: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The blocks of a page one after another, as a reader would type them."""
     names: dict[str, object] = {}
-    for block in blocks("python", PAGES[page]):
-        exec(block, names)
+    for code, shown in re.findall(OUTPUT, PAGES[page], re.DOTALL | re.MULTILINE):
+        exec(code, names)
+        assert capsys.readouterr().out.endswith(shown)
 
 
 def test_the_settings_exist(tmp_path: Path) -> None:
     """Every key and group of every bin/train in the pages, also of those that no test executes."""
-    for text in (README, CONFIGURATION, PAGES["how_to/gymnasium_environment"]):
+    for text in (README, *PAGES.values()):
         write_files(text, tmp_path)
     assert len(SETTINGS) > 40
     for words, own in sorted(SETTINGS):
@@ -195,6 +204,27 @@ def test_every_example_is_on_the_site() -> None:
     shown = set(re.findall(r"^```\{literalinclude\} \.\./\.\./(\S+)$", text, re.MULTILINE))
     files = [*(ROOT / "examples").rglob("*.py"), *(ROOT / "examples").rglob("*.yaml")]
     assert shown == {str(path.relative_to(ROOT)) for path in files}
+
+
+def test_the_reference_says_of_each_method_what_its_file_says_that_it_needs() -> None:
+    rows = [line.split(" | ") for line in PAGES["reference/methods"].splitlines()]
+    cells = {name: row[2] for row in rows for name in re.findall(r"^\| \[?`(\w+)`", row[0])}
+    for name, needs_of in needs([CONFIG_FOLDER]).items():
+        for word in ("target", "exact evaluation", "gradients", "schedule", "items"):
+            assert (word in cells[name]) == (word in " ".join(needs_of)), (name, word)
+
+
+@pytest.mark.parametrize("page", ["reference/configuration", "how_to/resume"])
+def test_the_reference_has_the_defaults(page: str) -> None:
+    config = OmegaConf.to_container(composed(["method=perf_gain"]), resolve=True)
+    for keys, defaults in re.findall(r"^\| (`[a-z].*?`) \| (\S.*?) \| ", PAGES[page], re.MULTILINE):
+        first, *others = re.findall("`([^`]+)`", keys)
+        names = [first, *(first.rpartition(".")[0] + other for other in others)]
+        values = defaults.replace("`", "").split(", ")
+        if len(values) == len(names) and not re.search(r"\*|^hydra", first):
+            for name, value in zip(names, values, strict=True):
+                found = functools.reduce(operator.getitem, name.split("."), config)
+                assert str(found).replace("None", "null") == value, name
 
 
 def test_every_method_scale_task_and_sweep_is_in_the_reference() -> None:

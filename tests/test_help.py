@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -65,39 +65,41 @@ def test_help_imports_nothing_that_takes_time(arguments: list[str], tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
 
 
-def ends(command: str, *arguments: object, folder: Path) -> subprocess.CompletedProcess[str]:
-    """How a command of bin/ ends; the last line is what it imported that takes seconds."""
-    code = (
-        "import atexit, runpy, sys; "
-        f"atexit.register(lambda: print(sorted({SLOW} & sys.modules.keys()))); "
-        "runpy.run_module(sys.argv.pop(1), run_name='__main__')"
-    )
-    words = map(str, (*MODULES[command].split(), *arguments))
-    return python(code, *words, path=CONFIG_FOLDER.parent, folder=folder)
+# Calls commands one after another, each as its words; none may import what takes seconds.
+CALLS = f"""
+import json, runpy, sys
+for module, *words in json.loads(sys.argv[1]):
+    sys.argv = ["command", *words]
+    code = 0
+    try:
+        runpy.run_module(module, run_name="__main__")
+    except SystemExit as end:
+        code = end.code or 0
+    print("ended with", code, *words, {SLOW} & sys.modules.keys(), flush=True)
+"""
 
 
-@pytest.mark.parametrize("command", sorted(MODULES))
-def test_no_commands_help_imports_what_takes_seconds(command: str, tmp_path: Path) -> None:
-    ended = ends(command, "--help", folder=tmp_path)
-    assert ended.returncode == 0 and command in ended.stdout, ended.stderr
-    assert ended.stdout.splitlines()[-1] == "[]"
+def ends(*commands: list[str], folder: Path) -> tuple[list[str], list[str]]:
+    """How commands of bin/ end that are called in one fresh interpreter, and what they refuse."""
+    calls = [[*MODULES[command].split(), *words] for command, *words in commands]
+    said = python(CALLS, json.dumps(calls), path=CONFIG_FOLDER.parent, folder=folder)
+    assert list(folder.iterdir()) == []
+    endings = [line for line in said.stdout.splitlines() if line.startswith("ended with")]
+    return endings, said.stderr.splitlines()
 
 
-@pytest.mark.parametrize(
-    ("command", "arguments"),
-    [
-        *((command, ["nowhere"]) for command in ("report", "play", "watch")),
-        ("eval", ["run", "--output", "rows.txt"]),
-        *(("train", ["+method=target", key]) for key in ("sede=1", "solver.batchsize=1")),
-        ("train", ["+method=magic"]),
-    ],
-)
-def test_a_refused_argument_imports_nothing_that_takes_seconds(
-    command: str, arguments: list[str], tmp_path: Path
-) -> None:
-    ended = ends(command, *arguments, folder=tmp_path)
-    (line,) = ended.stderr.splitlines()
-    name = arguments[-1].partition("=")[0].lstrip("+")
-    assert ended.returncode == 2 and line.startswith("error: ") and name in line
-    assert ended.stdout == "[]\n"
-    assert list(tmp_path.iterdir()) == []
+def test_no_commands_help_imports_what_takes_seconds(tmp_path: Path) -> None:
+    endings, refused = ends(*([command, "--help"] for command in MODULES), folder=tmp_path)
+    assert len(endings) == len(MODULES) and refused == []
+    assert all(re.fullmatch(r"ended with 0 .*--help set\(\)", line) for line in endings)
+
+
+def test_a_refused_argument_imports_nothing_that_takes_seconds(tmp_path: Path) -> None:
+    words = [[command, "nowhere"] for command in ("report", "play", "watch")]
+    words += [["eval", "run", "--output", "rows.txt"], ["train", "+method=magic"]]
+    words += [["train", "+method=target", key] for key in ("sede=1", "solver.batchsize=1")]
+    endings, refused = ends(*words, folder=tmp_path)
+    assert len(endings) == len(refused) == len(words)
+    for (*_, word), ending, line in zip(words, endings, refused, strict=True):
+        assert ending.startswith("ended with 2 ") and ending.endswith(f"{word} set()")
+        assert line.startswith("error: ") and word.partition("=")[0].lstrip("+") in line

@@ -73,16 +73,10 @@ def call_there(
     built: Built, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Callable[[str, Path], int]]:
     """Calls the commands with an extra, in a folder; returns the exit code."""
-    environment = tmp_path_factory.mktemp("environment")
-    sites = minimal.make_environment(environment, built.wheel, NAMED)
     kept = {name: os.environ[name] for name in ("PATH", "HOME") if name in os.environ}
-    compiled = []
-    if sys.pycache_prefix:
-        minimal.share_bytecode(sys.pycache_prefix, sites.values())
-        compiled = ["-X", f"pycache_prefix={sys.pycache_prefix}"]
     with subprocess.Popen(
-        [environment / "bin" / "python", "-I", *compiled, minimal.__file__],
-        cwd=environment,
+        [sys.executable, "-I", minimal.__file__, built.site, json.dumps(NAMED)],
+        cwd=tmp_path_factory.mktemp("elsewhere"),
         env=kept | {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -92,7 +86,7 @@ def call_there(
         asked, answers = process.stdin, process.stdout
 
         def there(extra: str, folder: Path) -> int:
-            asked.write(json.dumps([extra, str(sites[extra]), str(folder)]) + "\n")
+            asked.write(json.dumps([extra, str(folder)]) + "\n")
             asked.flush()
             return int(answers.readline())
 

@@ -171,12 +171,14 @@ def test_a_sweep_of_more_finds_the_runs_that_are_finished(train, capsys) -> None
 
 
 def test_a_method_with_and_without_its_ablation_in_any_order(composed) -> None:
-    arguments = ["-m", "+ablation=none,paper_literal", "+method=perf_gain", "+scale=smoke"]
-    made = composed(*arguments, "hydra.sweep.dir=all")
-    assert {ablation for _, _, ablation, _ in made} == {"none", "paper_literal"}
-    names = sorted(folder.name for folder in Path("all").iterdir() if folder.is_dir())
-    known = [f"perf_gain_ablation={name},scale=smoke_seed_0" for name in ("none", "paper_literal")]
-    assert names == known
+    made = composed(
+        *("-m", "+ablation=none,paper_literal", "+scale=smoke", "+method=perf_gain"),
+        "hydra.sweep.dir=all",
+    )
+    assert {path: run.ablation for path, run in made.items()} == {
+        f"all/perf_gain_ablation={name},scale=smoke_seed_0": name
+        for name in ("none", "paper_literal")
+    }
 
 
 def test_settings_name_a_folder() -> None:
@@ -277,21 +279,20 @@ def test_a_job_that_is_stopped_is_interrupted_and_its_sweep_says_so(
 
 @pytest.fixture
 def composed(train, monkeypatch: pytest.MonkeyPatch):
-    """Which runs a sweep makes, without making them: each reads its configuration and stops."""
+    """Which runs a sweep makes, by their folders, without making them: each stops when composed."""
 
-    def call(*arguments: str) -> set[tuple[str, str, str, int]]:
-        made = []
+    def call(*arguments: str) -> dict[str, RunConfig]:
+        made: dict[str, RunConfig] = {}
 
         def note(config: RunConfig, *_):
-            (seed,) = config.seeds
-            path = Path(HydraConfig.get().runtime.output_dir)
-            made.append((path.parent.name, config.method, config.ablation, seed))
+            path = Path(HydraConfig.get().runtime.output_dir).relative_to(Path.cwd()).as_posix()
+            assert path not in made
+            made[path] = config
             raise KeyError("enough")
 
         monkeypatch.setattr("proposer_rl.cli.run.parts", note)
         assert train(*arguments) == 1
-        assert len(set(made)) == len(made)
-        return set(made)
+        return made
 
     return call
 
@@ -303,55 +304,37 @@ def composed(train, monkeypatch: pytest.MonkeyPatch):
 def test_the_experiment_is_one_command(name: str, few: list[str], composed) -> None:
     seeds = (0, 3) if few else (3,)
     made = composed(f"+sweep={name}", *few, f"seed={','.join(map(str, seeds))}")
-    found = {method for _, method, _, _ in made}
     planned = OmegaConf.load(CONFIG_FOLDER / "sweep" / f"{name}.yaml").hydra.sweeper.params
     swept = set(planned["method"].split(","))
     assert {"perf_gain", "task_difficulty", "target", "domain_randomization"} <= swept
-    assert found == ({"target"} if few else swept)
-    assert made == {(name, method, "none", seed) for method in found for seed in seeds}
+    methods = {"target"} if few else swept
+    folders = {f"sweeps/{name}/{method}-none-seed_{seed}" for method in methods for seed in seeds}
+    assert made.keys() == folders
+    assert {(run.method, run.ablation) for run in made.values()} == {(m, "none") for m in methods}
 
 
-def test_a_proposer_is_used_on_a_solver_that_it_has_not_seen(
-    train, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_proposer_is_used_on_a_solver_that_it_has_not_seen(composed) -> None:
     """The literal Proposer and the frozen one lie beside the methods at medium scale."""
-    made = []
-
-    def note(config: RunConfig, *_):
-        path = Path(HydraConfig.get().runtime.output_dir).relative_to(Path.cwd())
-        made.append((str(path), config.checkpoint, config.seed, config.ablation))
-        raise KeyError("enough")
-
-    monkeypatch.setattr("proposer_rl.cli.run.parts", note)
-    assert train("+sweep=medium_frozen", "seed=107") == 1
-    assert train("+sweep=medium", "+method=perf_gain", "+ablation=paper_literal", "seed=107") == 1
-    frozen = "sweeps/medium/frozen_proposer-none-seed_107"
-    assert made == [
-        (frozen, "results/medium/proposer.pt", 107, "none"),
-        ("sweeps/medium/perf_gain-paper_literal-seed_107", None, 107, "paper_literal"),
-    ]
+    made = composed("+sweep=medium_frozen", "seed=107")
+    made |= composed("+sweep=medium", "+method=perf_gain", "+ablation=paper_literal", "seed=107")
+    assert {path: (run.checkpoint, run.seed) for path, run in made.items()} == {
+        "sweeps/medium/frozen_proposer-none-seed_107": ("results/medium/proposer.pt", 107),
+        "sweeps/medium/perf_gain-paper_literal-seed_107": (None, 107),
+    }
 
 
-def test_the_arena_is_one_command_and_one_more_method_one_more_row(
-    train, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = {}
-
-    def note(config: RunConfig, *_):
-        path = Path(HydraConfig.get().runtime.output_dir).relative_to(Path.cwd())
-        made[path.as_posix()] = config
-        raise KeyError("enough")
-
-    monkeypatch.setattr("proposer_rl.cli.run.parts", note)
-    row = "+method=no_oracle/currot"
-    assert train("+sweep=arena_develop", "task=arena/hill", row) == 1
-    assert train("+sweep=arena", "task=arena/hill", "+method=ncc", "seeds=[1,2]") == 1
+def test_the_arena_is_one_command_and_one_more_method_one_more_row(composed) -> None:
     folder, seeds = "sweeps/arena/arena/hill", [*range(100, 110)]
-    few = made.pop(f"{folder}/ncc-none-seed_1-2")
-    assert few.method == "ncc" and few.seeds == [1, 2] and few.model is None
-    ((path, asks),) = made.items()
+    ((path, asks),) = composed(
+        "+sweep=arena_develop", "task=arena/hill", "+method=no_oracle/currot"
+    ).items()
     assert path == f"{folder}/currot-modelled-seed_{'-'.join(map(str, seeds))}"
     assert asks.seeds == seeds and asks.model is not None
+    ((path, few),) = composed(
+        "+sweep=arena", "task=arena/hill", "+method=ncc", "seeds=[1,2]"
+    ).items()
+    assert path == f"{folder}/ncc-none-seed_1-2"
+    assert few.method == "ncc" and few.seeds == [1, 2] and few.model is None
 
 
 def test_the_arena_has_every_task_in_one_half_and_known_rows() -> None:

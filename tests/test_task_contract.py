@@ -47,12 +47,6 @@ def same(one: Any, other: Any) -> bool:
     return bool((one == other).all())
 
 
-def test_it_has_all_that_is_asked_for(task: Task) -> None:
-    assert isinstance(task, Task)
-    assert task.batch_size == P and task.precision == "fp32" and task.device.type == "cpu"
-    assert task.target in task.distributions.values()
-
-
 def test_levels_are_functions_of_their_generator(task: Task) -> None:
     for distribution in (task.target, task.space, *task.distributions.values()):
         one, again, other = (
@@ -79,15 +73,6 @@ def test_the_target_is_in_the_space(task: Task) -> None:
     shares = task.target_shares
     assert shares.shape == (task.space.size,) and shares.dtype == torch.float32
     assert (shares >= 0).all() and float(shares.sum()) == pytest.approx(1)
-
-
-def test_the_cars_target_is_one_of_its_bins() -> None:
-    task: Any = mountain_cars()
-    (target,) = task.target_shares.nonzero().flatten().tolist()
-    made = task.space.generate(torch.full((1, E), target), [Streams(0).generator()])[0]
-    wanted = task.target.sample(E, Streams(1).generator())
-    for name in ("gravity", "power"):
-        assert torch.equal(made[name], wanted[name])
 
 
 def test_coordinates_fill_the_square(task: Task) -> None:

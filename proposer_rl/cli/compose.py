@@ -12,7 +12,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from proposer_rl.cli.config import RunConfig, read_config
-from proposer_rl.cli.groups import Invocation, check_scale, python_path
+from proposer_rl.cli.groups import Invocation, check_scale, documented, python_path
 from proposer_rl.cli.run import carry_out
 from proposer_rl.cli.watch import show_run
 from proposer_rl.recipes import composed, plain_values, storable
@@ -42,7 +42,7 @@ def compose_and_run(
     config = read_config(composed(words, *own))
     asked = plain_values(OmegaConf.merge({}, *own))
     path = (folder or _new_folder(config)).expanduser().absolute()
-    invocation = Invocation(path, [*words], python_path=python_path(), settings=asked)
+    invocation = Invocation(path, documented(words), python_path=python_path(), settings=asked)
     with StopSignals() as signals:
         carry_out(config, invocation, signals, show_run)
     return path

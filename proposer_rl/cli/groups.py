@@ -16,11 +16,11 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from proposer_rl.cli.errors import ConfigError
+from proposer_rl.cli.help import GROUPS
 from proposer_rl.recipes import CONFIG_FOLDER, PACKAGE, available
 
 # Below these keys are the settings of curricula, most of which are in no file.
 BUILT = ("curriculum.", "filter.", "model.")
-SCALED = "maze"  # the task whose sizes the files of conf/scale set
 # The folders of a sweep are not named after these: they say where a run is computed and shown, or
 # have a place of their own in the name.
 UNNAMED = {"compute", "logger", "method", "seed", "seeds", "sweep"}
@@ -32,7 +32,7 @@ class Invocation(NamedTuple):
 
     Attributes:
         folder: the run's, absolute.
-        overrides: as on the command line, with the run's interpolations unresolved.
+        overrides: as on the command line, with the run's references unresolved.
         config_dir: given with ``--config-dir``; relative if it lies in the working folder.
         python_path: the caller's, without the checkout, which ``bin/`` adds.
         settings: that :func:`proposer_rl.train` merges into what is composed; None of a command.
@@ -50,7 +50,12 @@ def invocation(hydra: Any, folder: Path) -> Invocation:
     given = [s.path for s in hydra.runtime.config_sources if s.provider == "command-line"]
     overrides: Any = OmegaConf.to_container(hydra.overrides.task)
     here = next(map(_from_here, given), None)
-    return Invocation(folder.expanduser().absolute(), list(overrides), here, python_path())
+    return Invocation(folder.expanduser().absolute(), documented(overrides), here, python_path())
+
+
+def documented(overrides: Sequence[str]) -> list[str]:
+    """Returns overrides in the spelling of help and docs, ``+method=plr``; see :func:`arranged`."""
+    return [f"+{o}" if f"+{o.partition('=')[0]}=" in GROUPS else o for o in overrides]
 
 
 def python_path() -> str | None:
@@ -148,13 +153,16 @@ OmegaConf.register_new_resolver(
 
 
 def check_scale(overrides: Sequence[str]) -> None:
-    """Refuses a scale of another task, whose sizes would be merged into this one's."""
-    said = dict(override.split("=", 1) for override in overrides if "=" in override)
-    task, scale = said.get("task", SCALED), said.get("scale")
-    if scale in available("scale") and task in available("task") and task != SCALED:
-        raise ConfigError(
-            f"scale={scale}: is a scale of task={SCALED}; task={task} has sizes of its own"
-        )
+    """Refuses a scale, which is of the default task, for another task of ``conf/``."""
+    said = dict(override.lstrip("+").split("=", 1) for override in overrides if "=" in override)
+    task, scale = said.get("task"), said.get("scale")
+    if task in available("task") and scale in available("scale"):
+        defaults = OmegaConf.load(CONFIG_FOLDER / "train.yaml").defaults
+        scaled = next(group.task for group in defaults if "task" in group)
+        if task != scaled:
+            raise ConfigError(
+                f"scale={scale}: is a scale of task={scaled}; task={task} has sizes of its own"
+            )
 
 
 def check_chosen(config: DictConfig, hydra: Any) -> None:

@@ -241,7 +241,7 @@ def to_go_on(asked: Invocation) -> str:
     paths, config = asked.python_path, asked.config_dir
     before = [f"PYTHONPATH={shlex.quote(paths)}"] if paths else []
     options = ["--config-dir", config] if config else []
-    own = [word for word in asked.overrides if not word.startswith("sweep=")]
+    own = [word for word in asked.overrides if not word.startswith("+sweep=")]
     words = shlex.join([*options, *own, quoted("hydra.run.dir", str(asked.folder))])
     return " ".join([*before, "bin/train", words])
 

@@ -13,13 +13,9 @@ from proposer_rl.cli.build import make_task
 from proposer_rl.cli.config import RunConfig, saved_config
 from proposer_rl.cli.errors import ConfigError
 from proposer_rl.learning import PPO
-from proposer_rl.runs.checkpoint import (
-    CheckpointError,
-    checkpoint_files,
-    load_checkpoint,
-    load_latest,
-)
+from proposer_rl.runs.checkpoint import checkpoint_files, load_checkpoint, load_latest
 from proposer_rl.runs.folder import write_atomically
+from proposer_rl.settings import within
 from proposer_rl.streams import Streams
 from proposer_rl.task import Task
 
@@ -59,14 +55,10 @@ class StoredRun(NamedTuple):
         assert found is not None, "there is a checkpoint"
         step, state = found
         learner = self.task.learner([Streams(seed) for seed in seeds])
-        try:
-            every = TensorDict(state["solver"], [len(self.config.seeds)])
+        every = TensorDict(state["solver"], [len(self.config.seeds)])
+        with within("checkpoint", ValueError):  # of another network
             learner.restore(every[[self.config.seeds.index(seed) for seed in seeds]])
-            return Stage(step, int(state["updates"]), learner)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise CheckpointError(
-                "the checkpoint holds no Solver with the network of its run's config.json"
-            ) from error
+        return Stage(step, int(state["updates"]), learner)
 
 
 def stored_run(path: Path) -> StoredRun:

@@ -23,6 +23,17 @@ of the last batch's bridge and the target, where the space knows what lies betwe
 interpolation of Klink et al. 2022, "Curriculum Reinforcement Learning via Constrained Optimal
 Transport" (ICML), with particles in place of bins, and no pace but what is mastered.
 
+Where failures all return the same and uniform levels are seldom solved, most episodes teach
+nothing. With u the success on uniform levels lately, and d how dense rewards are, the standard
+deviation of the returns of failures over that of all returns, in units of DENSE and at most 1,
+
+    c = clamp((OFTEN - u) / (OFTEN - SELDOM), 0, 1) (1 - d of uniform levels).
+
+With ``concentrate``, c moves the bridge's part q to MOST, its candidates to MANY times as many,
+``delta`` to MASTERED and ``low`` to LEAST. Where levels come back one by one, c is 0: there are few
+of them near to the target, and the bridge would repeat them. The target's share rises later where
+rewards are sparse: HALF becomes HALF d + SPARSE_HALF (1 - d), with d of levels of the target.
+
 A data set has items that come back, and nothing between two of them. There is nothing to be made,
 so that there are more candidates, all different, and learnability counts for more; and their
 success is drawn from the posterior, so that items of which little or nothing new is known are
@@ -61,12 +72,17 @@ SUMS = (
     *("levels", "successes", "labels", "squared labels"),
     *("predicted", "squared predicted", "products"),
     *("returns", "squared returns"),
+    *("failures", "failed", "squared failed"),  # of which the last two are returns
 )
 FLOOR, LOW, HIGH = 0.1, 0.25, 0.9  # of the share of the target
-# b at half of the distance from low to HIGH; where success is not told
+# b at half of the distance from low to HIGH; without successes
 HALF, HALF_OF_RETURNS = 0.1, 0.5
 # part q: with no skill it is that in the middle
 BRIDGE_LEAST, BRIDGE_AT_ONCE, BRIDGE_MOST = 0.2, 0.4, 0.8
+# Success on uniform levels up to which the bridge is concentrated, and from which on it is not; the
+# ratio of deviations from which on rewards are dense; and what is moved to where they are sparse.
+SELDOM, OFTEN, DENSE = 0.2, 0.4, 0.25
+MOST, MANY, MASTERED, LEAST, SPARSE_HALF = 0.95, 16, 0.5, 0.05, 0.4
 SOON, LATER = 6.0, 20.0  # half-lives in batches: of sums, and of b where success falls again
 # Added to the sums of squares of predictions and labels that a correlation is of: a few say little.
 UNSURE = 0.05, 0.5
@@ -79,6 +95,7 @@ NEAR = 0.025  # standard deviation of what is added between two levels, in share
 # grows faster than with the square: of 288, it is 10 ms in blocks of 64, 30 of 128, 150 at once.
 # Of more than LARGE, blocks are half as large, which takes a third of the time.
 AT_ONCE, LARGE = 64, 512
+MOST_LEVELS = 3072  # candidates of a batch, where more are wanted where it is concentrated
 FORBIDDEN = 1e3  # cost of a candidate that is not mastered
 FAILURES = 4.0  # on the target, that are taken for seen at the beginning
 SHOWN = 6  # levels of each arm that a reader is shown
@@ -106,6 +123,9 @@ class AdaptiveMixture(Curriculum):
         delta: least expected success of a level of the bridge.
         half_life: batches after which the belief counts an outcome half.
         times: candidates for each level of the bridge.
+        concentrate: whether the bridge gets nearly all of a batch while uniform levels are seldom
+            solved and failures all return the same, and the target's share rises later there. It
+            changes nothing for a data set, and where no success is told.
     """
 
     optional_results = ("success",)
@@ -133,14 +153,17 @@ class AdaptiveMixture(Curriculum):
         delta: Share = 0.3,
         half_life: Annotated[float, Ge(1)] = 12.0,
         times: Count = 4,
+        concentrate: bool = False,
     ) -> None:
         self._space, self._target = space, target
         # A data set has items, and nothing between two of them.
         self._is_data = hasattr(space, "items") and not hasattr(space, "between")
         self._known = inputs or partial(level_inputs, space)
         self._delta, self._half_life, self._times = delta, half_life, times
+        self._concentrate = concentrate and not self._is_data
         one = space.sample(1, torch.Generator())
         items = 0 if self._items(one) is None else space.size
+        self._come_back = items > 0
         expected = getattr(space, "expected", None)
         width = self._known(one).shape[-1]
         self._belief = Belief(width, items, expected=expected, half_life=half_life)
@@ -149,6 +172,7 @@ class AdaptiveMixture(Curriculum):
         # The lowest returns and the negatives of the highest [2, m], of how many levels.
         self._ends, self._number = torch.zeros(2, 0, dtype=torch.float64), 0
         self._told = False  # whether success is told
+        self._concentration = 0.0  # c, of the next batch
         self._last: Levels = one[:0]  # of the bridge, [m]
         self._came: list[dict[str, Any]] = []  # what the next proposal learns from
         self._seen = Predictions()
@@ -189,7 +213,7 @@ class AdaptiveMixture(Curriculum):
         """Returns the shares and what they follow from, and how right the belief was.
 
         ``shares`` of the arms, ``target_success``, b, ``target_signal``, how much returns on the
-        target differ in units of all, and ``skill`` of the belief, each student's; and as
+        target differ in units of all, ``skill`` of the belief, ``concentration``, c; and as
         :func:`~proposer_rl.curricula.outcome_model.calibration`.
         """
         shown, self._shown = self._shown, {}
@@ -216,6 +240,9 @@ class AdaptiveMixture(Curriculum):
             "products": predicted * labels,
             "returns": returns,
             "squared returns": returns.square(),
+            "failures": 1 - success,
+            "failed": (1 - success) * returns,
+            "squared failed": (1 - success) * returns.square(),
         }
         rows = torch.stack([of[name] for name in SUMS], -1)
         arms = F.one_hot(seen["arm"], len(ARMS)).double().mT
@@ -245,18 +272,26 @@ class AdaptiveMixture(Curriculum):
         """Returns the shares of the arms in the next batch, float64 [3]."""
         sums = dict(zip(SUMS, self._sums.unbind(-1), strict=True))
 
-        def variance(name: str, of: Callable[[Tensor], Tensor]) -> Tensor:
+        def variance(name: str, of: Callable[[Tensor], Tensor], number: str = "levels") -> Tensor:
             """Returns the variance of what was summed up, of some arms: []."""
-            number, total, squares = (of(sums[n]) for n in ("levels", name, f"squared {name}"))
-            square = squares / number
-            found = square - (total / number).square()
+            count, total, squares = (of(sums[n]) for n in (number, name, f"squared {name}"))
+            square = squares / count
+            found = square - (total / count).square()
             return found.where(found > EQUAL * square, 0.0)
 
+        every = variance("returns", lambda one: one.sum())
+
+        def dense(arm: int) -> Tensor:
+            """Returns d of an arm: 0 where all failures on it return the same, 1 where dense."""
+            ratio = (variance("failed", lambda one: one[arm], "failures") / every).sqrt()
+            return (ratio.nan_to_num(0.0, posinf=1.0) / DENSE).clamp(max=1)
+
         own = variance("returns", lambda one: one[TARGET])
-        signal = (own / variance("returns", lambda one: one.sum())).sqrt()
+        signal = (own / every).sqrt()
         signal = signal.nan_to_num(1.0, posinf=1.0).clamp(max=1)  # before anything is seen
-        number, came, expected, products = (
-            sums[name][UNIFORM] for name in ("levels", "labels", "predicted", "products")
+        number, came, expected, products, solved = (
+            sums[name][UNIFORM]
+            for name in ("levels", "labels", "predicted", "products", "successes")
         )
         squares = [
             number * variance(name, lambda one: one[UNIFORM]) + unsure
@@ -265,17 +300,25 @@ class AdaptiveMixture(Curriculum):
         covered = products - expected * came / number
         skill = (covered / (squares[0] * squares[1]).sqrt()).nan_to_num(0.0)
         low = FLOOR + (LOW - FLOOR) * (2 * signal).clamp(max=1)
-        half = HALF if self._told else HALF_OF_RETURNS
+        half = torch.tensor(HALF if self._told else HALF_OF_RETURNS, dtype=torch.float64)
+        bridge = (BRIDGE_AT_ONCE + skill / 2).clamp(BRIDGE_LEAST, BRIDGE_MOST)
+        if self._concentrate and self._told:
+            half = SPARSE_HALF + (half - SPARSE_HALF) * dense(TARGET)
+            if not self._come_back:
+                seldom = ((OFTEN - solved / number) / (OFTEN - SELDOM)).clamp(0, 1)
+                c = (seldom * (1 - dense(UNIFORM))).nan_to_num(0.0)
+                low, bridge = low + c * (LEAST - low), bridge + c * (MOST - bridge)
+                self._concentration = float(c)
         target = low + (HIGH - low) * self._best / (self._best + half)
         if self._target is None:
             target = torch.zeros_like(target)
-        bridge = (BRIDGE_AT_ONCE + skill / 2).clamp(BRIDGE_LEAST, BRIDGE_MOST)
         shares = torch.stack([target, (1 - target) * (1 - bridge), (1 - target) * bridge], -1)
         self._shown |= {
             "shares": dict(zip(ARMS, shares.tolist(), strict=True)),
             "target_success": float(self._best),
             "target_signal": float(signal),
             "skill": float(skill),
+            "concentration": self._concentration,
         }
         return shares
 
@@ -296,6 +339,7 @@ class AdaptiveMixture(Curriculum):
         goal = self._space if self._target is None else self._target
         targets = goal.sample(count, draw)
         times = self._times * (ITEMS_TIMES if self._is_data else 1)
+        times = max(times, min(round(times * MANY**self._concentration), MOST_LEVELS // count))
         levels = self._candidates(times * count, targets, draw)
         goals, x, items = self._inputs(targets), self._inputs(levels), self._items(levels)
         # Items are explored by draws, which differ where little is known, or nothing new.
@@ -303,7 +347,8 @@ class AdaptiveMixture(Curriculum):
             p = self._belief.predict(x, items)
         else:
             p = self._belief.draw(x, items, draw)
-        allowed = p >= p.topk(count).values[-1].clamp(max=self._delta)
+        delta = self._delta + self._concentration * max(MASTERED - self._delta, 0)
+        allowed = p >= p.topk(count).values[-1].clamp(max=delta)
         bonus = ITEMS_LEARNABLE if self._is_data else LEARNABLE
         extra = torch.where(allowed, -bonus * 4 * p * (1 - p), FORBIDDEN)
         most, start = AT_ONCE if count <= LARGE else AT_ONCE // 2, 0

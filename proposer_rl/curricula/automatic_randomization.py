@@ -23,27 +23,27 @@ INSIDE = -1  # of a point that lies on no bound
 class BoundsCurriculum(CountingCurriculum):
     """Draws levels uniformly within bounds that move outwards where the student succeeds.
 
-    A level is a point of the box [-1, 1]^D that the space's coordinates span. There are a lower and
-    an upper bound of every coordinate, which begin at one point. A part of the levels lie on a
-    bound: one of the bounds, drawn uniformly, gives a coordinate, and the others are uniform within
-    theirs. What came of these levels is collected for each bound. When there are ``episodes`` of
-    them, the bound moves outwards by a step if their mean is at least ``upper``, inwards if it is
-    at most ``lower``, and collects anew (OpenAI et al. 2019, "Solving Rubik's Cube with a Robot
+    A level is a point of the box [-1, 1]^D that the space's coordinates span. Every coordinate has
+    a lower and an upper bound, which start at the same point. Some of the levels lie on a bound:
+    one coordinate is at a bound that is drawn uniformly, and the others are uniform within theirs.
+    The results of these levels are collected for each bound. After ``episodes`` results, the bound
+    moves outwards by a step if their mean is at least ``upper``, inwards if it is at most
+    ``lower``, and starts to collect again (OpenAI et al. 2019, "Solving Rubik's Cube with a Robot
     Hand", arXiv 1910.07113, algorithm 1).
 
-    Levels on a bound that has moved since they were proposed do not count. The student trains on
-    all levels, also those on bounds; bounds stay in the box, and never leave the start out.
+    Levels on a bound that has moved since their proposal do not count. The student trains on all
+    levels, also on those at bounds. Bounds stay in the box and never exclude the start.
 
     Args:
         space: that has the bins.
         start: where the bounds begin, from -1 for the first to 1 for the last value of an axis, by
-            the axis's name; 0, the middle, for others.
-        step: of a bound.
-        lower: mean at most which a bound moves inwards.
-        upper: mean at least which it moves outwards.
-        episodes: that each move is decided by.
-        boundary: part of the levels that lie on a bound.
-        measure: of what levels come to, ``"success"`` or ``"return"``.
+            the axis's name; 0, the middle, for other axes.
+        step: by which a bound moves.
+        lower: a bound moves inwards if the mean is at most this.
+        upper: a bound moves outwards if the mean is at least this.
+        episodes: number of results that decide a move.
+        boundary: share of the levels that lie on a bound.
+        measure: result of a level, ``"success"`` or ``"return"``.
         rounded: see :class:`~proposer_rl.curricula.points.Points`.
 
     Attributes:
@@ -79,7 +79,7 @@ class BoundsCurriculum(CountingCurriculum):
         # Of the numbers of bounds that move, 2 d and 2 d + 1 are coordinate d's.
         self._movable = (2 * self._points.free.unsqueeze(-1) + torch.arange(2)).flatten()
         self.bounds = self._start.expand(2, -1).mT.clone()
-        # What the levels on each bound came to since it has moved, and how many, [2 D].
+        # Sum and number of the results on each bound since its last move, [2 D].
         self._sums = torch.zeros(2 * self._points.size, dtype=torch.float64)
         self._played = torch.zeros(2 * self._points.size, dtype=torch.int64)
 

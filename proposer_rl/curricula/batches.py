@@ -22,9 +22,8 @@ class SomeBins:
     """Draws levels uniformly from some of a space's bins.
 
     Args:
-        space: with the bins.
-        values: for some of its axes, by name, those values whose bins count; named as the argument
-            of replay in errors.
+        space: that has the bins.
+        values: allowed values of some of its axes, by name; errors call them ``new_levels``.
 
     Raises:
         ArgumentError: for an axis or a value that the space does not have.
@@ -84,9 +83,8 @@ def saved(value: Any) -> Any:
 def restored(state: Any, present: Any) -> Any:
     """Returns the attribute that a state holds; the inverse of :func:`saved`.
 
-    An object with a state of its own is kept, and loads that. Levels, also those within a
-    tensordict, become of the class and go to the device of those that are there at present, of
-    which there may be none, ``levels[:0]``.
+    An object with a ``load_state_dict`` loads its part. Levels, also within a tensordict, get the
+    class and the device of the present ones, which may be empty, ``levels[:0]``.
     """
     if is_tensor_collection(present):
         return unpacked(state, present)
@@ -105,7 +103,7 @@ def packed(entries: TensorDictBase) -> dict[str, Any]:
 def unpacked(state: Mapping[str, Any], like: Any) -> Any:
     """Rebuilds the tensordict [m] that :func:`packed` copied.
 
-    It, and levels in it, become of the class and go to the device of ``like``.
+    The tensordict, and levels in it, get the class and the device of ``like``.
     """
     if isinstance(like, TensorDict):
         entries = {
@@ -146,8 +144,8 @@ def moved(levels: Levels, device: torch.device) -> Levels:
 def level_keys(levels: Any) -> Tensor:
     """Hashes each of levels [*B] to a number that only equal levels share: int64 [*B].
 
-    Hashes of the bytes of all entries, eight at a time: two levels collide with a probability of
-    about 2^-64. Each eight go through the finalizer of SplitMix64 (Steele et al. 2014).
+    It hashes the bytes of all entries, eight at a time, with the finalizer of SplitMix64 (Steele et
+    al. 2014). Two different levels collide with a probability of about 2^-64.
     """
     count = levels.batch_size.numel()
     names = sorted(levels.keys(True, True), key=str)

@@ -47,16 +47,15 @@ class CountingCurriculum(Curriculum):
 class BinCurriculum(CountingCurriculum):
     """Draws batches from shares of the bins, which regular scoring passes renew.
 
-    A subclass says what a scoring pass is, what the shares are made of, and what is learnt from
-    outcomes.
+    A subclass defines the scoring pass, the shares, and what to learn from outcomes.
 
     Args:
         space: that has the bins.
-        every: batches between two scoring passes.
+        every: number of batches between two scoring passes.
     """
 
     shown: ClassVar[Sequence[str]] = ("score",)
-    """Scores that are logged."""
+    """The scores to log."""
     state: ClassVar[tuple[str, ...]] = ("scores", "_counts", "_proposed")
 
     @checked
@@ -64,7 +63,7 @@ class BinCurriculum(CountingCurriculum):
         refuse_unfit_bins(space)
         super().__init__(space)
         self._every, self._proposed = every, 0
-        self.scores: dict[str, Tensor] = {}  # what the shares come from, each [N], on the CPU
+        self.scores: dict[str, Tensor] = {}  # from which shares are computed, each [N], on the CPU
 
     @abstractmethod
     def score(self, student: Student, count: int, rng: Streams) -> None:
@@ -132,12 +131,12 @@ def means_of_bins(choices: Tensor, values: Tensor, size: int) -> tuple[Tensor, T
 class Probes:
     """Measures the student's performance on fixed levels of every bin.
 
-    The levels are drawn at the first time, from the streams of that proposal, and stay. What is
-    measured is exact where the student's performance is.
+    The levels are drawn once, from the random streams of the first proposal. The measurement is
+    exact if the student's performance is.
 
     Args:
         space: that has the bins.
-        count: levels of each bin.
+        count: number of levels of each bin.
         measure: ``"success"`` or ``"return"``.
     """
 
@@ -150,7 +149,7 @@ class Probes:
         """Measures the student's mean performance in each bin: float32 [N], on the CPU.
 
         Raises:
-            NoSuccessError: if success is to be measured and the task has none.
+            NoSuccessError: if success is measured and the task has none.
         """
         size = self._space.size
         if self._levels is None:
@@ -161,7 +160,7 @@ class Probes:
         performance = student.performance(self._levels, rng.generator("probe_episodes"))
         if self.measure not in performance.keys():
             raise NoSuccessError(
-                f"measure={self.measure}: this task tells no success, only the return; give "
+                f"measure={self.measure}: this task tells no success, only the return; set "
                 "measure=return"
             )
         reached = performance[self.measure].unflatten(-1, (size, self._count)).mean(-1)  # [N]

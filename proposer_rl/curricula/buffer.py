@@ -1,21 +1,21 @@
 """A buffer of N scored levels, and the functions that draw from it and change it.
 
-Prioritised level replay (Jiang et al. 2021, arXiv 2010.03934, section 3) keeps levels with a score
-of how much there is to learn on them, and draws them again from
+Prioritised level replay (Jiang et al. 2021, arXiv 2010.03934, section 3) keeps levels with scores
+of how much a student can learn on them, and draws them again from
 
     P  =  (1 - staleness) w  +  staleness u,
 
-w the *score weights* and u, which is proportional to the time since a level was last drawn or
-scored, the *staleness weights*. A buffer is a tensordict [N] on the CPU:
+where w are the *score weights*, and the *staleness weights* u are proportional to the time since a
+level was last drawn or scored. A buffer is a tensordict [N] on the CPU with these entries:
 
 - ``level``: the levels;
-- ``filled`` bool: whether there is one; nothing else of an empty slot counts;
-- ``score`` float64; ``best`` float32, the highest return that was ever seen on the level;
-- ``reached`` float32, the return when the level was trained on last; else minus infinity;
-- ``touched`` int64: the clock when it was drawn or scored last. A clock counts the levels that were
-  drawn or scored; it is the entry ``clock``, the same in all slots;
-- ``key`` int64: equal for equal levels; ``parent``: that of the level that it was edited from, 0
-  for none; ``generation`` int64: edits since a level that was generated; ``draws`` int64.
+- ``filled`` bool: whether the slot holds a level; other entries of an empty slot mean nothing;
+- ``score`` float64; ``best`` float32: the highest return ever seen on the level;
+- ``reached`` float32: the return when the level was last trained on, or minus infinity;
+- ``touched`` int64: the clock when the level was last drawn or scored. The clock counts draws and
+  scores; it is the entry ``clock``, the same in all slots;
+- ``key`` int64: equal for equal levels only; ``parent``: the key of the level that was edited, 0
+  for none; ``generation`` int64: number of edits since a generated level; ``draws`` int64.
 
 Slots are changed level by level, with NumPy, because a level is only a few numbers: ``numbers`` are
 entries of the buffer by name, arrays [N] that are changed in place. A new score moves only the
@@ -58,12 +58,12 @@ class ReplayRule:
     """Says how levels are drawn from a buffer.
 
     Attributes:
-        prioritization: what the score weights depend on. ``rank``: r^(-1/T) of the r-th best score;
-            ``proportional``: max(score, 0)^(1/T); ``softmax``: exp(score / T). Where all scores are
+        prioritization: form of the score weights. ``rank``: r^(-1/T) of the r-th best score;
+            ``proportional``: max(score, 0)^(1/T); ``softmax``: exp(score / T). If all scores are
             equal, or no weight is above zero, all weights are equal.
-        temperature: T; towards 0 the best level takes all, towards infinity all are alike.
-        best: the number of levels with the highest scores that get weights at all; None for all.
-        staleness: share of the draws that go by the time since the last one.
+        temperature: T; towards 0 the best level takes all, towards infinity all are equal.
+        best: number of levels with the highest scores that get any weight; None for all.
+        staleness: share of the draws by the time since a level was last drawn or scored.
     """
 
     prioritization: Prioritization = "rank"
@@ -94,8 +94,8 @@ def score_weights(score: Tensor, filled: Tensor, rule: ReplayRule) -> Tensor:
 
     Args:
         score: float [*B, N].
-        filled: bool [*B, N]; empty slots have no rank and no share.
-        rule: of equal scores the earlier slot ranks first.
+        filled: bool [*B, N]; empty slots get no rank and no share.
+        rule: of the draws; among equal scores the earlier slot ranks first.
 
     Returns:
         float64 [*B, N].
@@ -116,7 +116,7 @@ def shares_by_rank(falling: Tensor, count: Tensor, rule: ReplayRule) -> Tensor:
 
     Args:
         falling: the scores, float64 [*B, N].
-        count: how many of them there are, int64 [*B, 1]; the others come last, and get none.
+        count: number of real scores, int64 [*B, 1]; the rest come last and get no share.
         rule: of the draws.
     """
     rank = torch.arange(1, falling.shape[-1] + 1)
@@ -148,7 +148,7 @@ def replay_weights(score: Tensor, age: Tensor, filled: Tensor, rule: ReplayRule)
 
     Args:
         score: float [*B, N].
-        age: int64 [*B, N], what the clock has advanced since a level was drawn or scored.
+        age: int64 [*B, N], by how much the clock has advanced since a level was drawn or scored.
         filled: bool [*B, N].
         rule: of the draws.
     """
@@ -158,10 +158,7 @@ def replay_weights(score: Tensor, age: Tensor, filled: Tensor, rule: ReplayRule)
 
 
 def draw_slots(
-    buffer: TensorDictBase,
-    count: int,
-    rule: ReplayRule,
-    generator: torch.Generator,
+    buffer: TensorDictBase, count: int, rule: ReplayRule, generator: torch.Generator
 ) -> Tensor:
     """Draws levels one after another; each draw advances the clock and resets the age of its level.
 
@@ -185,15 +182,15 @@ def draw_slots(
 def insert(buffer: TensorDictBase, new: TensorDictBase, rule: ReplayRule) -> None:
     """Inserts scored levels one after another.
 
-    A level that is there already gets its new score. Another one gets the next free slot; where
-    there is none, that of the level that is least likely to be drawn, if its score is higher than
-    that one's. Equal levels among the new ones count once, with the mean of their scores.
+    A level that the buffer already holds gets its new score. Any other level takes the next free
+    slot. If there is none, it replaces the level that is least likely to be drawn, provided that
+    its score is higher. Equal levels among the new ones count once, with the mean of their scores.
 
     Args:
         buffer: [N].
-        new: [M] with ``level``, ``score`` and ``best``, and where it is not zero ``parent`` and
-            ``generation``; ``reached`` where they were trained on. Scores that are not finite are
-            those of levels not to be kept.
+        new: [M] with ``level``, ``score`` and ``best``; edited levels also have ``parent`` and
+            ``generation``, and levels that were trained on ``reached``. A level whose score is not
+            finite is not kept.
         rule: of the draws.
     """
 
@@ -235,10 +232,10 @@ def rescore(
 
     Args:
         buffer: [N].
-        slots: int64 [m]; of a slot that occurs several times the mean score counts.
-        score: float [m]; one that is not finite leaves the level's old score.
-        best: float [m], the highest returns, of which the highest ever is kept.
-        reached: float [m], the returns, taken as scores are; None where nobody was trained.
+        slots: int64 [m]; a slot that occurs several times gets the mean of its scores.
+        score: float [m]; a score that is not finite leaves the old one in place.
+        best: float [m], the highest returns; the buffer keeps the highest ever.
+        reached: float [m], the returns, treated like scores; None if the levels were only played.
     """
     new = {"score": score, **({} if reached is None else {"reached": reached})}
     for name, entry in new.items():
@@ -253,7 +250,7 @@ def lineage(buffer: TensorDictBase, most: int) -> Tensor:
 
     Args:
         buffer: [N].
-        most: slots of the line, counted from its end, that are returned at most.
+        most: largest number of slots to return, counted from the end of the chain.
     """
     place = {key: slot for slot, key in enumerate(buffer["key"].tolist())}
     parents = [place.get(key) for key in buffer["parent"].tolist()]
@@ -306,9 +303,9 @@ def draw_row(
     """Draws slots one after another; each draw advances the clock and resets the age of its level.
 
     Args:
-        numbers: of a row with a level.
+        numbers: of a buffer that holds a level.
         by_score: shares of the slots by their scores, [N].
-        staleness: share of the draws that go by age.
+        staleness: share of the draws by age.
         noise: uniform in [0, 1), [P].
 
     Returns:
@@ -341,9 +338,9 @@ class Ranks:
     """Keeps the slots in order of falling score, with their shares; ties go to the earlier slot.
 
     Args:
-        score: of all slots, [N], which :meth:`change` changes.
-        weigh: shares by rank.
-        by_rank: whether these are the same whatever the scores are, as long as two of them differ.
+        score: of all slots, [N]; :meth:`change` changes it in place.
+        weigh: returns shares by rank.
+        by_rank: whether the shares depend on ranks alone, as long as two scores differ.
     """
 
     def __init__(self, score: Floats, weigh: Weigh, by_rank: bool) -> None:
@@ -390,16 +387,16 @@ def insert_row(
     Changes ``filled``, ``key``, ``score``, ``touched`` and ``clock``.
 
     Args:
-        numbers: of the row.
+        numbers: of the buffer.
         keys: of the new levels, [M].
-        scores: of them; one that is not finite is not kept.
-        staleness: share of the draws that go by age.
-        weigh: shares by rank of scores that fall.
+        scores: of the new levels; levels without a finite score are not kept.
+        staleness: share of the draws by age.
+        weigh: returns shares by rank of falling scores.
         by_rank: see :class:`Ranks`.
 
     Returns:
-        Which new level has gone into each slot, int64 [N], -1 for none; and slots and levels of
-        those that were there already, int64 [2, m].
+        Which new level each slot received, int64 [N], -1 for none; and slots and numbers of new
+        levels that the buffer already held, int64 [2, m].
     """
     if len(keys) > ONE_BY_ONE:
         return _insert_at_once(numbers, keys, scores, staleness, weigh)

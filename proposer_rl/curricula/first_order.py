@@ -26,14 +26,14 @@ class FirstOrderCurriculum(BinCurriculum):
 
     Args:
         space: that has the bins.
-        target: the distribution that is to be mastered.
-        every: batches between two scoring passes.
+        target: the distribution to master.
+        every: number of batches between two scoring passes.
         temperature: the share of bin n is proportional to exp(s_n / (temperature * max |s|)), with
             s its averaged score.
         smoothing: share of the old score in the average.
-        target_levels: fresh levels E of the target that the direction is taken from.
-        candidates: levels C of each bin.
-        step: of the differences that give the alignments, in learning rates.
+        target_levels: number E of fresh levels of the target that give the direction.
+        candidates: number C of levels of each bin.
+        step: of the finite differences that give the alignments, in learning rates.
         measure: of the target's performance; see
             :func:`~proposer_rl.meta.first_order.target_performance`.
     """

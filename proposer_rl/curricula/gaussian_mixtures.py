@@ -20,40 +20,39 @@ from proposer_rl.settings import ArgumentError, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Space
 
-LEAST_STORED = 6  # earlier episodes, below which progress is 0
+LEAST_STORED = 6  # earlier episodes; with fewer, progress is 0
 TwoOrMore = Annotated[int, Interval(ge=2, le=1_000_000)]
 
 
 class MixtureCurriculum(CountingCurriculum):
     """Draws levels as points of a box, from Gaussians fitted to recent learning progress.
 
-    A point of the box [-1, 1]^D that the space's coordinates span is rounded to a bin, whose
-    coordinates x are the task. The progress of an episode on x with return r is |r - r'|, with r'
-    that of the nearest earlier task in the whole history. The first ``warmup`` points are
-    drawn uniformly from the box; then, at every ``refit`` episodes, a mixture of Gaussians is
-    fitted to the points and the progress of the last ``refit``, from which all but a part of the
-    draws come (Portelas et al. 2019, arXiv 1910.07224, algorithm 1; see
+    A point of the box [-1, 1]^D, which the space's coordinates span, is rounded to a bin; the
+    coordinates x of the bin are the task. The progress of an episode on x with return r is
+    |r - r'|, where r' is the return on the nearest earlier task of the whole history. The first
+    ``warmup`` points are uniform in the box. Then, after every ``refit`` episodes, a mixture of
+    Gaussians is fitted to the points and the progress of the last ``refit`` episodes, and all but
+    a part of the points are drawn from it (Portelas et al. 2019, arXiv 1910.07224, algorithm 1; see
     :func:`fit_mixture` and :func:`draw_points`).
 
-    Points and not bins are what mixtures are fitted to: on a grid the likelihood has no bound.
-    Bins and not points are compared: between two points with a border of bins in between, the
-    difference of the bins would pass for progress for ever.
+    Mixtures are fitted to points, not bins, because on a grid the likelihood has no bound. Progress
+    compares bins, not points, because the constant difference between two bins would pass for
+    progress for ever.
 
-    The episodes of one batch are played by one and the same student: none of them is earlier than
-    another, and each is compared with those of earlier batches. Of equally near ones the last
-    counts.
+    All episodes of a batch are played by the same student. So none of them is earlier than another,
+    and each is compared with those of earlier batches; ties go to the last one.
 
     Args:
         space: that has the bins.
-        source: of the return: ``"episodes"`` for what came of training on the level; ``"exact"``
-            for the student's performance on it when it was proposed, which costs an evaluation and
-            is exact where that is.
-        warmup: episodes before the first mixture.
-        refit: episodes between two mixtures, and that one is fitted to.
-        components: the most Gaussians of a mixture; there are at least two.
-        exploration: part of the draws that come uniformly from the box.
-        rounded: whether points become bins; else they are levels and tasks as they are, which a
-            space of continuous parameters has (its method ``at``).
+        source: of the return: ``"episodes"`` for the return in training; ``"exact"`` for the
+            student's performance at the time of the proposal, which costs an evaluation and is
+            exact if the task's performance is.
+        warmup: number of episodes before the first mixture.
+        refit: number of episodes between two mixtures, and to which one is fitted.
+        components: largest number of Gaussians in a mixture; the smallest is two.
+        exploration: share of the points that are uniform in the box.
+        rounded: whether to round points to bins; otherwise points are levels and tasks themselves,
+            which needs a space of continuous parameters (with a method ``at``).
 
     Raises:
         ValueError: if scikit-learn is missing, the numbers of episodes are not in order, or the
@@ -187,7 +186,7 @@ def fit_mixture(points: Tensor, most: int, generator: torch.Generator) -> tuple[
     seeds = torch.randint(2**31, (most - 1,), generator=generator).tolist()
     # Several threads would add up in any order, and the same run would not come out again.
     with warnings.catch_warnings(), threadpool_limits(1):
-        # Fewer distinct points than components, or slow convergence: the AIC decides on what came.
+        # Fewer distinct points than components, or slow convergence: the AIC decides all the same.
         warnings.simplefilter("ignore", ConvergenceWarning)
         mixtures = [
             GaussianMixture(count, random_state=seed).fit(data)
@@ -216,7 +215,7 @@ def draw_points(
     progress = means[:, -1].clamp(min=0)
     weights = progress if bool(progress.sum() > 0) else torch.ones_like(progress)
     which = torch.multinomial(weights, count, replacement=True, generator=generator)
-    # Without its last coordinate a Gaussian is one of the others' means and covariances.
+    # The marginal without the last coordinate has the other means and covariances.
     middles, spread = means[:, :-1], covariances[:, :-1, :-1]
     noise = torch.randn(count, middles.shape[1], 1, generator=generator, dtype=means.dtype)
     return middles[which] + (torch.linalg.cholesky(spread)[which] @ noise).squeeze(-1)
@@ -233,8 +232,8 @@ def absolute_progress(
     Args:
         tasks: the earlier ones, the oldest first, float [H, D].
         returns: on them, float [H].
-        new_tasks: those of the new episodes, float [P, D].
-        new_returns: on them, float [P].
+        new_tasks: tasks of the new episodes, float [P, D].
+        new_returns: returns of the new episodes, float [P].
 
     Returns:
         float [P].

@@ -37,7 +37,7 @@ PRIOR = math.pi**2 / 16 - 0.5  # variance of the arc length of a probability tha
 class ItemCurriculum(Curriculum):
     """Draws items by numbers that it keeps about each and updates by the answers.
 
-    A subclass says which numbers these are at first, what is drawn, and what is learnt.
+    A subclass defines the first numbers, the draws, and how to learn.
 
     Args:
         space: of N items, or with N bins.
@@ -50,7 +50,7 @@ class ItemCurriculum(Curriculum):
         refuse_unfit_bins(space)
         self.space = space
         self.numbers: dict[str, Tensor] = {}  # none before the first proposal
-        self._came: list[dict[str, Tensor]] = []  # what the next proposal learns from
+        self._came: list[dict[str, Tensor]] = []  # from which the next proposal learns
         self._seen = Predictions()
 
     @abstractmethod
@@ -109,16 +109,16 @@ class ItemCurriculum(Curriculum):
 class BetaSampling(ItemCurriculum):
     """MoPPS: draws each item's success from a Beta distribution; takes those nearest to an aim.
 
-    Qu et al. 2025 (arXiv 2507.04632): of an item that was drawn,
+    Qu et al. 2025 (arXiv 2507.04632). For an item that was answered,
 
         a <- decay a + (1 - decay) + m,    b <- decay b + (1 - decay) + G - m,
 
-    both 1 at first; those are drawn whose draws from Beta(a, b) are the nearest to ``aim``.
+    with a = b = 1 at first. The items whose draws from Beta(a, b) are nearest to ``aim`` come next.
 
     Args:
         space: see :class:`ItemCurriculum`.
-        decay: part of what was known that is kept at each observation.
-        aim: success that is looked for.
+        decay: share of the old counts that an observation keeps.
+        aim: wanted success.
     """
 
     @checked
@@ -133,7 +133,7 @@ class BetaSampling(ItemCurriculum):
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Draws the items nearest to the aim."""
-        # What is public, torch.distributions, takes no generator.
+        # The public torch.distributions takes no generator.
         a, b = (
             torch._standard_gamma(self.numbers[name], generator=generator) for name in ("a", "b")
         )
@@ -154,31 +154,26 @@ class BetaSampling(ItemCurriculum):
 class AdaptiveDifficulty(ItemCurriculum):
     """AdaRFT: draws the items nearest to a difficulty that follows the mean success.
 
-    Shi et al. 2025 (arXiv 2504.05520), with difficulties from 0 to 1, 1 less a pass rate: with r
-    the mean success of a batch,
+    Shi et al. 2025 (arXiv 2504.05520). The difficulty of an item is 1 minus its pass rate. With r
+    the mean success of a batch, the wanted difficulty T changes by
 
-        T <- T + step tanh(sensitivity (r - aim)),    within the difficulties there are,
+        T <- T + step tanh(sensitivity (r - aim)),
 
-    which begins with the lowest.
+    clipped to the difficulties of the items. It starts at the lowest.
 
     Args:
         space: of items with a pass rate each.
-        step: of T at most.
-        sensitivity: of T to the reward.
-        aim: success that is looked for.
+        step: largest change of T.
+        sensitivity: of T to the mean success.
+        aim: wanted success.
 
     Raises:
-        ArgumentError: if items have no pass rates.
+        ArgumentError: if an item has no pass rate.
     """
 
     @checked
     def __init__(
-        self,
-        space: Space,
-        *,
-        step: Positive = 0.5,
-        sensitivity: Positive = 2.0,
-        aim: Share = 0.5,
+        self, space: Space, *, step: Positive = 0.5, sensitivity: Positive = 2.0, aim: Share = 0.5
     ) -> None:
         super().__init__(space)
         rates: Tensor | None = getattr(space, "pass_rates", None)
@@ -211,12 +206,12 @@ class AdaptiveDifficulty(ItemCurriculum):
 class CategoryBandit(ItemCurriculum):
     """SEC: draws categories by a learnt value of each, and items of a category uniformly.
 
-    Chen et al. 2025 (arXiv 2505.14970): shares are softmax(Q / temperature), and with r the mean
-    size of an advantage in the answers of a category, TD(0) is
+    Chen et al. 2025 (arXiv 2505.14970). The shares of categories are softmax(Q / temperature). With
+    r the mean absolute advantage of the answers in a category, TD(0) updates its value by
 
         Q <- (1 - rate) Q + rate r,    0 at first.
 
-    Where advantages are divided by the deviation in their group, r is 2 sqrt(p (1 - p)) of a group
+    If advantages are divided by the deviation in their group, r is 2 sqrt(p (1 - p)) for a group
     with a share p of successes. Groups need several answers.
 
     Args:
@@ -265,7 +260,7 @@ class CategoryBandit(ItemCurriculum):
         if not self._warned and single(seen["count"]) and not spread.any():
             self._warned = True
             warnings.warn(
-                "sec: a single answer has no advantage, so that all categories stay alike; tell "
+                "sec: a single answer has no advantage, so all categories stay alike; tell "
                 "episodes= of several",
                 stacklevel=2,
             )
@@ -280,22 +275,22 @@ class CategoryBandit(ItemCurriculum):
 class ArcLengthFilter(ItemCurriculum):
     """Tracks each item's arc length, psi = arcsin(sqrt(p)), and draws those near a wanted one.
 
-    After ARCUS (arXiv 2609.38018). Whatever p is, the arc length z of m of G answers has the
-    variance 1 / (4 G + 2), and 1 / (2 G) where all or none were right, see :func:`arc_length`. A
-    Kalman filter of each item follows it; all of them move with one drift per batch, which is
-    filtered, too. Items are drawn without replacement in proportion to
+    After ARCUS (arXiv 2609.38018). The estimate z of an arc length from m of G answers has the
+    variance 1 / (4 G + 2) for any p, or 1 / (2 G) if all or none were right; see
+    :func:`arc_length`. A Kalman filter for each item follows its estimates. All items share one
+    drift per batch, which is filtered as well. Items are drawn without replacement in proportion to
 
         (overlap of N(psi, variance) with N(wanted, width^2)) (1 - p^G - (1 - p)^G),
 
-    wanted being the lowest p at which a group is mixed with at least 1 - ``slack`` of the highest
-    probability.
+    where wanted belongs to the lowest p at which a group is mixed with at least 1 - ``slack`` of
+    the highest probability.
 
     Args:
         space: see :class:`ItemCurriculum`.
-        noise: variance that an item's arc length gains in a batch.
-        drift_noise: that the drift gains.
-        width: of what is wanted.
-        slack: part of the mixed groups that harder items may cost.
+        noise: variance that an item's arc length gains per batch.
+        drift_noise: variance that the drift gains per batch.
+        width: standard deviation around the wanted arc length.
+        slack: share of the mixed groups to give up for harder items.
     """
 
     @checked
@@ -371,13 +366,13 @@ def nearest(
 ) -> Tensor:
     """Returns the places of the smallest distances in random order, int64 [n].
 
-    Equal ones are taken at random; each comes once, or as often as all do.
+    Ties are broken at random. Each place occurs once, or, if n exceeds N, about equally often.
 
     Args:
         distances: float [N].
         count: number n of places.
         generator: of the CPU.
-        smallest: whether a sign counts; else the distance is from 0.
+        smallest: whether signs count; otherwise absolute values are compared.
     """
     mixed_up = torch.randperm(len(distances), generator=generator)
     keys = distances[mixed_up] if smallest else distances[mixed_up].abs()

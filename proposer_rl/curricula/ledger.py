@@ -121,7 +121,7 @@ class Ledger:
             block = self.blocks[each - 1]
             place = ids[which] - block.start
             states = block.state.take(place, mode="clip")
-            states[place >= block.end - block.start] = OVER  # what is between blocks is over
+            states[place >= block.end - block.start] = OVER  # ids between blocks are over
             wrong = np.flatnonzero(states != OUT)
             if len(wrong):
                 self._refuse(int(ids[which[wrong[0]]]), states[wrong[0]])
@@ -156,7 +156,7 @@ class Ledger:
         block = self.block_of(id)
         place = 0 if block is None else id - block.start
         if block is None or block.state[place] != OUT:
-            self.find(np.array([id]))  # says what is wrong with it
+            self.find(np.array([id]))  # raises the error
         assert block is not None
         for name, result in results.items():
             block.results[name][place] = result

@@ -19,35 +19,35 @@ from proposer_rl.task import Space
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Of a program, for steps of about ten seconds: 250 items in a row take as long as 8³ bins.
+# Bins for which a step takes about ten seconds: 250 items in a row take as long as 8³ bins.
 MOST_IN_A_ROW, MOST_OF_A_GRID = 256, 512
-NOTHING = 1e-6  # a share that is rounding of the solver's
-SLACK = 1e-6  # of the reach, where the solver finds nothing at the nearest distribution itself
+NOTHING = 1e-6  # shares below this are rounding of the solver
+SLACK = 1e-6  # of the reach, if the solver finds nothing at the nearest distribution itself
 
 
 class TransportCurriculum(BinCurriculum):
     """Draws batches from a distribution that moves towards the target.
 
-    At a scoring pass, the distribution p over the bins becomes the nearest to the target, in the
-    2-Wasserstein distance of the space's coordinates, among those that are within epsilon of the
-    present one and on bins in which the student's performance is at least delta (Klink et al. 2022,
-    "Curriculum Reinforcement Learning via Constrained Optimal Transport", ICML). Where no bin is,
-    those of the best performance are taken for it, so that the search begins with what is easiest.
-    The first distribution is uniform.
+    Each scoring pass replaces the distribution over the bins by the one nearest to the target in
+    the 2-Wasserstein distance of the space's coordinates, among those within epsilon of the current
+    one and on bins where the student's performance is at least delta (Klink et al. 2022,
+    "Curriculum Reinforcement Learning via Constrained Optimal Transport", ICML). If no bin is that
+    good, the bins with the best performance count instead, so that the search begins with the
+    easiest ones. The first distribution is uniform.
 
-    See :func:`step_towards` for the program, and for what happens when the student forgets.
+    See :func:`step_towards` for the linear program, and for what happens if the student forgets.
 
     Args:
         space: that has the bins.
         target_shares: the target as shares of the bins, float [N].
         delta: least performance of a bin that is drawn from.
-        epsilon: how far the distribution moves at a scoring pass; neighbouring bins of an axis with
-            n values are about 2 / (n - 1) apart.
-        every: batches between two scoring passes.
-        probes: levels of each bin.
+        epsilon: largest move in a scoring pass; neighbouring bins of an axis with n values are
+            about 2 / (n - 1) apart.
+        every: number of batches between two scoring passes.
+        probes: number of levels of each bin.
         measure: of performance, ``"success"`` or ``"return"``.
-        exploration: part of each batch that is drawn uniformly while performance is below delta
-            in all bins of the target; then of the share of the target where it still is.
+        exploration: uniform part of each batch while performance is below delta in all bins of the
+            target. It shrinks with the share of the target where this is still so.
 
     Raises:
         ArgumentError: if there are too many bins.
@@ -74,8 +74,8 @@ class TransportCurriculum(BinCurriculum):
         if space.size > most:
             raise ArgumentError(
                 f"space: {space.size:,} bins: optimal transport takes minutes on more than {most}; "
-                "give fewer bins or items, or take domain_randomization with filter=model, which "
-                "has no limit"
+                "use fewer bins or items, or domain_randomization with filter=model, which has no "
+                "limit"
             )
         super().__init__(space, every=every)
         self._exploration = exploration
@@ -137,8 +137,8 @@ def step_towards(
         minimise <C, A>  with  A >= 0, B >= 0, A 1 = B 1 = p, A'1 = target, B'1 = now,
                                <C, B> <= reach^2.
 
-    Where the present distribution is not on allowed bins any more, it may be that nothing on them
-    is within reach; reach is then that of the nearest distribution on them.
+    If the current distribution is no longer on allowed bins, there may be nothing on them within
+    reach; the reach then extends to the nearest distribution on them.
 
     Args:
         target: shares that add up to one, [N].
@@ -194,7 +194,7 @@ def step_towards(
             A_eq=equal.tocsr(),
             b_eq=np.concatenate([target[to], now[fro], np.zeros(count)]),
             method="highs",
-            # Presolving takes what the shares are off by, 1e-16 in their sums, for a contradiction.
+            # Presolving would take rounding, 1e-16 in the sums of shares, for a contradiction.
             options={"presolve": False},
         )
         if result.x is not None:

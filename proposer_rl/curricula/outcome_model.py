@@ -1,13 +1,13 @@
 """Predicts what a student would reach on any level, from the levels that it trained on.
 
-Every update ends with labelled data, levels and what came of them, that cost nothing more. Of the
-last batches' rows phi_i with outcomes y_i, where what is ``age`` batches old has the weight
+Every update provides labelled data, levels and their outcomes, at no extra cost. A logistic
+regression on the rows phi_i of the last batches, with outcomes y_i, gives the probability of
+success. A row that is ``age`` batches old has the weight
 
-    w_i = 2 ** (-age_i / half_life),
+    w_i = 2 ** (-age_i / half_life).
 
-a logistic regression gives the probability of success. Since students get better, one of the
-features is -age_i / half_life, and 0 is what it is on the levels that are asked about: what was
-true on average a half-life ago is carried forward to the present. The regression minimises
+Because students get better, one of the features is -age_i / half_life. It is 0 for a prediction, so
+the model extrapolates the trend over time to the present. The regression minimises
 
     sum_i w_i (log(1 + exp(z_i)) - y_i z_i) + ridge / 2 |beta|^2,    z_i = beta . phi_i.
 
@@ -17,11 +17,11 @@ and the expectation of 1 / (1 + exp(-z)) about
 
     p = 1 / (1 + exp(-z / sqrt(1 + pi s^2 / 8)))
 
-(MacKay 1992, "The evidence framework applied to classification networks", Neural Computation 4):
-near one half where there are no data, whatever beta says.
+(MacKay 1992, "The evidence framework applied to classification networks", Neural Computation 4).
+Where there are no data it is near one half for any beta.
 
-The mean of the return comes from a linear regression. With r_i the returns, brought to mean 0 and
-deviation 1 by their weights,
+The mean of the return comes from a linear regression. With r_i the returns, standardised to a
+weighted mean of 0 and deviation of 1,
 
     minimise  sum_i w_i (r_i - a . phi_i)^2 + ridge |a|^2.
 """
@@ -50,15 +50,15 @@ Labels = Literal["success", "above_worst"]
 Features = Callable[[Levels], Tensor]
 """Maps levels [K, n] to the features of a model: float [K, n, F], each about -1 to 1."""
 
-KEPT = 4  # half-lives, after which a batch is forgotten
+KEPT = 4  # half-lives after which a batch is forgotten
 STEPS = 50  # of Newton's method, at most
 HALVINGS = 8  # of a step, at most, until it makes the loss no larger
-CLOSE = 1e-10  # coefficients that change no more than this are found
-EQUAL = 1e-6  # returns that differ no more than this are equal, in units of the worst one
+CLOSE = 1e-10  # coefficients have converged when they change by less than this
+EQUAL = 1e-6  # relative difference up to which returns count as equal
 
 ANSWERED = ("performance", "exact_performance")
-LOGGED = 100  # batches at most, whose predictions a log is about: loops may go on without one
-PARTS = 10  # of the probabilities from 0 to 1, in which what was predicted is compared
+LOGGED = 100  # batches at most whose predictions are kept for a log, which loops may never ask for
+PARTS = 10  # intervals of [0, 1] in which predictions are compared with outcomes
 
 
 def logistic_ridge(
@@ -118,22 +118,22 @@ class OutcomeModel:
     """Predicts what a student would reach on levels, from the outcomes of recent batches.
 
     Args:
-        labels: what the probability is of: ``"success"``, as outcomes have it; or
-            ``"above_worst"``, a return above the lowest that there ever was. Where failures all
-            have the same return, the two are one. Where every step is rewarded, nearly every
-            episode is above the worst: no level is silent, and each teaches something.
-        ridge: on the coefficients.
-        half_life: batches after which a row counts half.
+        labels: the event whose probability is predicted: ``"success"``, an entry of outcomes; or
+            ``"above_worst"``, a return above the lowest ever seen. The two agree if all failures
+            have the same return. If every step is rewarded, nearly every episode is above the
+            worst, so that every level has some probability.
+        ridge: penalty on the coefficients.
+        half_life: number of batches after which a row has half its weight.
 
     Attributes:
-        required_results: entries of an outcome that it takes in.
+        required_results: entries of an outcome that it needs.
     """
 
     def __init__(
         self, *, labels: Labels = "success", ridge: float = 0.3, half_life: float = 12.0
     ) -> None:
         self._labels, self._ridge, self._half_life = labels, ridge, half_life
-        # Outcomes do not always have an entry that nobody needs.
+        # Entries that are not required may be missing in some outcomes.
         self.required_results = ("return", "success") if labels == "success" else ("return",)
         self._batches: list[dict[str, Tensor]] = []
         self._worst = torch.tensor(torch.inf, dtype=torch.float64)
@@ -143,9 +143,9 @@ class OutcomeModel:
         """Adds a batch to the training data.
 
         Args:
-            features: float64 [m, F]; a constant one is a further intercept.
-            outcome: what it ``required_results`` names, float64 [m].
-            as_old: whether it is as old as the batch before it, and a part of that.
+            features: float64 [m, F]; a constant feature acts as an intercept.
+            outcome: the entries in ``required_results``, float64 [m].
+            as_old: whether these rows belong to the batch that was added last.
         """
         batch = {"features": features, **{name: outcome[name] for name in self.required_results}}
         if as_old:
@@ -158,8 +158,7 @@ class OutcomeModel:
     def predict(self, features: Tensor) -> TensorDict:
         """Predicts the outcome of levels with features float64 [n, F]: a tensordict [n].
 
-        ``success`` and ``return``, each float64. Before there is any row they are 0.5 and 0
-        everywhere.
+        It has ``success`` and ``return``, each float64. Without any rows they are 0.5 and 0.
         """
         shape = features.shape[:1]
         if not self._batches:
@@ -222,14 +221,14 @@ class OutcomeModel:
 class Modelled(Combinator):
     """Runs a curriculum on predictions of the student's performance instead of evaluations.
 
-    Whatever the curriculum asks as ``performance`` or ``exact_performance``, by a scoring pass or a
-    filter, an :class:`~proposer_rl.curricula.outcome_model.OutcomeModel` answers, which is fitted
-    to what came of the levels that the student was trained on. That costs no frames, no
-    evaluations and no oracle.
+    When a scoring pass or a filter of the curriculum asks for ``performance`` or
+    ``exact_performance``, an :class:`~proposer_rl.curricula.outcome_model.OutcomeModel` answers. It
+    is fitted to the outcomes of the levels on which the student trained, so it costs no frames and
+    no evaluations, and needs no oracle.
 
     Args:
-        curriculum: any.
-        features: of levels, such as ``task.features`` or a space's alone, see
+        curriculum: any curriculum.
+        features: of levels, such as ``task.features``, or those of a space alone; see
             :func:`~proposer_rl.task.space_features`.
         labels, ridge, half_life: see the model.
     """
@@ -328,9 +327,9 @@ class Predictions:
 def calibration(predicted: Tensor, label: Tensor) -> dict[str, Any]:
     """Compares probabilities that were predicted with what happened, ready for JSON.
 
-    ``brier``, the mean squared error of the predicted probabilities, and ``brier_constant``, that
-    of one number for all; ``reliability``, for each tenth of the probabilities how many were
-    predicted there, their mean, and the mean of what it was.
+    ``brier`` is the mean squared error of the probabilities, and ``brier_constant`` that of the
+    best constant. ``reliability`` has for each tenth of the probabilities the number of
+    predictions, their mean, and the mean of the labels.
 
     Args:
         predicted: probabilities float64 [m].

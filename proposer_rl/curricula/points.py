@@ -15,7 +15,7 @@ from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels, Space, refuse_many_bins, refuse_unfit_bins
 
-CHUNK = 2**16  # places that are compared at once
+CHUNK = 2**16  # places to compare at once
 Place = Annotated[float, Interval(ge=-1, le=1)]
 """A parameter's place in its range, from -1 to 1."""
 
@@ -25,8 +25,8 @@ class Points:
 
     Args:
         space: that has the bins.
-        rounded: whether points become levels of the nearest bins; else they are levels as they are,
-            which a space of continuous parameters has (its method ``at``).
+        rounded: whether to round points to the nearest bins; otherwise points are levels
+            themselves, which needs a space of continuous parameters (with a method ``at``).
 
     Attributes:
         size: the number D of coordinates.
@@ -39,7 +39,7 @@ class Points:
         if rounded and space.axes and space.size < 2:
             raise ArgumentError(
                 "rounded=true: the space has a single bin, to which all points would be rounded; "
-                "give its axes bins, or rounded=false"
+                "give its axes bins, or set rounded=false"
             )
         if not space.axes:
             refuse_unfit_bins(space)
@@ -86,7 +86,7 @@ class Points:
         """Returns the point with the given places along named axes, and 0 elsewhere: float64 [D].
 
         Raises:
-            ArgumentError: for a name that is no axis's.
+            ArgumentError: for an unknown axis.
         """
         names = [*self._space.axes]
         if len(names) != self.size:  # such as features of items

@@ -29,14 +29,14 @@ from proposer_rl.task import Distribution, Levels, Space, Task, refuse_unfit_bin
 class ProblemProposer(CountingCurriculum):
     """Draws each of P problems from a policy, and trains the policy by the reward of each.
 
-    At every proposal the policy sees what the student would do on probe levels of the target, draws
-    the bin of each problem, and is rewarded for each, standardised over all that it drew. A few
-    gradient steps follow on the clipped objective of each problem (Schulman et al. 2017, eq. 7).
-    It has no critic.
+    At every proposal the policy sees the student's outputs on probe levels of the target, draws the
+    bin of each problem, and gets a reward for each, standardised over all draws. A few gradient
+    steps follow on the clipped objective of each problem (Schulman et al. 2017, eq. 7). There is no
+    critic.
 
     Args:
         space: that has the bins.
-        target: the distribution of the levels through which the student is seen.
+        target: the distribution of the probe levels.
         agent: from ``probes`` [K, C, ...] to logits [K, P, N] of independent categoricals, as
             :func:`~proposer_rl.models.proposer_actor_critic` makes it of a ``ProblemHead``.
         settings: PPO's numbers, of which ``epochs``, ``learning_rate``, ``adam_eps``,
@@ -87,7 +87,7 @@ class ProblemProposer(CountingCurriculum):
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
         """Draws levels [n] from the policy, and trains it on them at once.
 
-        The policy draws P at a time, and learns from all that it drew.
+        The policy draws multiples of P levels, and learns from all of them.
 
         Raises:
             DivergedError: if an advantage, a loss, a gradient or a weight is not finite.
@@ -148,7 +148,7 @@ class ProblemProposer(CountingCurriculum):
             self._adam.step()
             terms = losses.select("loss_objective", "loss_entropy").detach()
             steps.append(terms.set("grad_norm", norm))
-            with located("the Proposer"):  # before it draws from weights that are no numbers
+            with located("the Proposer"):  # before it draws from weights that are not finite
                 weights, reward = dict(self.agent.named_parameters()), played["advantage"]
                 require_finite(reward.transpose(0, 1), TensorDict.stack(steps), weights, None)
         self._metrics |= {
@@ -164,8 +164,8 @@ class FirstOrderProposer(ProblemProposer):
 
     Args:
         space, target, agent, settings, probe_levels: see :class:`ProblemProposer`.
-        target_levels: fresh levels E of the target that the direction is taken from.
-        step: of the differences that give the alignments, in learning rates.
+        target_levels: number E of fresh levels of the target that give the direction.
+        step: of the finite differences that give the alignments, in learning rates.
         measure: of the target's performance; see
             :func:`~proposer_rl.meta.first_order.target_performance`.
     """
@@ -210,10 +210,10 @@ class PairedProposer(ProblemProposer):
 
         max(0, J(antagonist, level) - J(protagonist, level)).
 
-    J is a student's performance, which may be exact; published are the antagonist's best and the
-    protagonist's mean episode. The levels are drawn from the space's bins, each rewarded by itself,
-    rather than built cell by cell. The antagonist trains on the levels that came back, with an
-    update for as many of them as an update takes.
+    J is a student's performance, which may be exact; the paper uses the antagonist's best and the
+    protagonist's mean episode. Levels are drawn from the space's bins, each with its own reward,
+    rather than built cell by cell. The antagonist trains on the observed levels, with one update
+    for as many of them as an update takes.
 
     Args:
         space, target, agent, settings, probe_levels: see :class:`ProblemProposer`.
@@ -237,7 +237,7 @@ class PairedProposer(ProblemProposer):
     ) -> None:
         super().__init__(space, target, agent, settings, probe_levels=probe_levels)
         self.antagonist, self._learner = TaskStudent(task, antagonist), antagonist
-        # Levels [m] that the antagonist is to train on, and the seeds of its actions there.
+        # Levels [m] on which the antagonist has yet to train, and the seeds of its actions there.
         self._levels: Levels = target.sample(1, torch.Generator())[:0]
         self._seeds: list[int] = []
 

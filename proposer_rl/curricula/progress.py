@@ -32,16 +32,15 @@ class LearningProgressCurriculum(BinCurriculum):
 
     Args:
         space: that has the bins.
-        every: batches between two scoring passes.
-        source: of p: ``"exact"`` for fixed levels of every bin, which is exact where the task's
-            performance is and costs evaluations; ``"episodes"`` for what came of training on the
-            bin since the last scoring pass, which costs nothing. Of a bin without any, the
-            averages stay.
-        probes: levels of each bin.
-        measure: ``"success"``; or ``"return"``, for tasks without success, and then without g,
-            which is of probabilities.
-        fast, slow: share of the old in either average.
-        exploration: part of each batch that is drawn uniformly.
+        every: number of batches between two scoring passes.
+        source: of p: ``"exact"`` evaluates fixed levels of every bin, which costs evaluations and
+            is exact if the task's performance is; ``"episodes"`` uses the results of training since
+            the last scoring pass, which costs nothing, and keeps the averages of bins without any.
+        probes: number of levels of each bin.
+        measure: ``"success"``; or ``"return"`` for tasks without success, in which case g, a
+            function of probabilities, is left out.
+        fast, slow: share of the old value in each average.
+        exploration: uniform part of each batch.
     """
 
     shown = ("score", "performance")
@@ -66,7 +65,7 @@ class LearningProgressCurriculum(BinCurriculum):
         probed = probes if source == "exact" else 0
         self._source, self._probes = source, Probes(space, probed, measure)
         self._fast, self._slow, self._exploration = fast, slow, exploration
-        # Sum and number of what came of each bin since the last scoring pass, [N].
+        # Sum and number of the results in each bin since the last scoring pass, [N].
         self._episodes: list[Tensor] = []
 
     def score(self, student: Student, count: int, rng: Streams) -> None:

@@ -24,20 +24,20 @@ from proposer_rl.task import Levels
 class ProposerCurriculum(LearnedCurriculum):
     """Lets an agent, the Proposer, choose the levels; it learns from replicas of the student.
 
-    With a trainer, before each cycle K replicas of the student go through one episode of the
-    meta-environment, and the Proposer's PPO learns from them. Without a trainer the Proposer is
-    frozen. Then the student itself trains on the Proposer's proposals.
+    Before each cycle the trainer runs one episode of the meta-environment with K replicas of the
+    student, and the Proposer's PPO learns from it. Without a trainer the Proposer is frozen. During
+    the cycle the student itself trains on the Proposer's proposals.
 
     Args:
         agent: the Proposer.
-        view: what it sees of the student; its levels are new at every cycle.
-        actions: from its actions to levels.
-        meta_episode_length: updates L of the episodes in which it learns or has learnt, from which
-            it knows how far a cycle has gone.
-        action_repeat: batches for which an action holds.
+        view: how it sees the student, by levels that are new in every cycle.
+        actions: turns its actions into levels.
+        meta_episode_length: number L of updates in an episode of its training, by which it knows
+            its progress in a cycle.
+        action_repeat: number of batches for which an action holds.
         own_action: the action for the student itself: a ``"sample"`` of the policy, or its
             ``"mode"``, without exploration.
-        trainer: trains the Proposer; None to leave it as it is.
+        trainer: trains the Proposer; None for a frozen one.
     """
 
     state = ("_proposed", "_action")
@@ -53,18 +53,12 @@ class ProposerCurriculum(LearnedCurriculum):
         own_action: Literal["sample", "mode"],
         trainer: ProposerTrainer | None = None,
     ) -> None:
-        self.agent = agent
-        self.view = view
-        self.actions = actions
-        self.meta_episode_length = meta_episode_length
-        self.action_repeat = action_repeat
+        self.agent, self.view, self.actions, self.trainer = agent, view, actions, trainer
+        self.meta_episode_length, self.action_repeat = meta_episode_length, action_repeat
         self.own_action = own_action
-        self.trainer = trainer
-        # To see the student; and while the Proposer learns, to make replicas.
-        self.needs = ("performance", "probe")
         self.trains_replicas = trainer is not None
-        if self.trains_replicas:
-            self.needs += ("snapshot",)
+        # The first two to see the student, a snapshot to make replicas of it.
+        self.needs = ("performance", "probe", *["snapshot"] * self.trains_replicas)
         self._proposed = 0  # batches of this cycle
         self._action: Tensor | None = None
 
@@ -118,7 +112,7 @@ class ProposerCurriculum(LearnedCurriculum):
             self.trainer.replicas.close()
 
     def _act(self, student: Student, rng: Streams) -> Tensor:
-        # A cycle may be longer than the episodes that it learnt in: then another one begins.
+        # If a cycle is longer than a training episode, progress starts over.
         progress = self._proposed % self.meta_episode_length / self.meta_episode_length
         # -1: before all episodes of the replicas, whose numbers begin at 0.
         draws = self.view.streams.generator("evaluation", -1, self._proposed)
@@ -154,8 +148,7 @@ class ProposerTrainer:
                 f"the Proposer's horizon {learner.settings.horizon} must be the "
                 f"meta-environment's number of steps, {env.steps}"
             )
-        self.learner = learner
-        self.env = env
+        self.learner, self.env = learner, env
         self.replicas = replicas or Replicas(learner)
 
     def curriculum(self, own_action: Literal["sample", "mode"]) -> ProposerCurriculum:
@@ -181,8 +174,8 @@ class ProposerTrainer:
         rewards = rollout["next", "reward"].sum((-2, -1))  # [K]
         replicas = len(rewards)
         student.spend(
-            frames=replicas * env.frames_per_update * env.meta_episode_length,
-            # Every replica after each of its actions, and all of them once at the start.
+            frames=replicas * env.batch_of_levels * env.solvers.horizon * env.meta_episode_length,
+            # Every replica after each of its actions, and once at the start.
             evaluations=replicas * (env.steps + 1) * env.view.validation_levels,
         )
         return self._metrics(rollout, rewards, training)

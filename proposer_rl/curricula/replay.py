@@ -53,11 +53,11 @@ from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels, Space
 
 Edit = Callable[[Levels, int, Sequence[torch.Generator]], Levels]
-"""Levels [K, n] after so many small random edits each, those of row k from generator k."""
+"""Edits levels [K, n] by a number of small random changes each; row k draws from generator k."""
 Parents = Literal["batch", "easy"]
 
-EASY = 4  # parents of a batch of edits, where they are not all of the batch
-SHOWN = 6  # levels of each kind that a reader is shown
+EASY = 4  # parents of a batch of children, unless all of the batch are
+SHOWN = 6  # levels of each kind in a report
 
 
 class ReplayCurriculum(Curriculum):
@@ -82,7 +82,7 @@ class ReplayCurriculum(Curriculum):
         renew: whether to renew all scores before each draw, instead of the scores of the levels
             that were trained on.
         co_learnability: how much the scores of the previous batch rise for each unit by which the
-            scores of this batch have fallen (TRACED, arXiv 2506.19997).
+            scores of this batch have fallen (TRACED, arXiv 2506.19997); no effect if ``renew``.
 
     Raises:
         DivergedError: in :meth:`propose`, if a level is to be replayed and none has a score.
@@ -115,11 +115,6 @@ class ReplayCurriculum(Curriculum):
             raise ArgumentError(
                 "train_on_new=true, synchronous=true: new levels are either trained on or only "
                 "scored; set one of the two to false"
-            )
-        if renew and co_learnability:
-            raise ArgumentError(
-                f"co_learnability={co_learnability}, renew=true: where all scores are renewed "
-                "before each draw, nothing is left of what is added to them; set one of them to 0"
             )
         if edits and edit is None:
             raise ArgumentError(

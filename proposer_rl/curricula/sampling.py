@@ -16,7 +16,7 @@ from proposer_rl.settings import Count, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels
 
-SHOWN = 6  # levels that a reader is shown
+SHOWN = 6  # levels in a report
 
 
 class SamplingCurriculum(Curriculum):
@@ -38,19 +38,19 @@ class SelectionCurriculum(Curriculum):
     """Scores many candidates every few batches, and proposes the best of them and new levels.
 
     SFL (Rutherford et al. 2024, "No Regrets", arXiv 2408.15099, algorithm 1), with learnability as
-    the score. The levels that are kept are drawn uniformly and with replacement; nothing is scored
-    while the student trains.
+    the score. The kept levels are drawn uniformly and with replacement; nothing is scored while the
+    student trains.
 
     Args:
-        space: where levels come from.
-        scorer: of them.
-        candidates: levels M that are scored.
-        keep: of them.
-        every: batches between two such selections.
-        new: share of a batch that is drawn anew instead, rounded.
+        space: from which levels are drawn.
+        scorer: scores the candidates.
+        candidates: number M of levels that are scored.
+        keep: number of them that are kept.
+        every: number of batches between two selections.
+        new: share of new levels in a batch, rounded.
 
     Raises:
-        ArgumentError: if more are to be kept than are scored.
+        DivergedError: in :meth:`propose`, if fewer candidates have a score than are to be kept.
     """
 
     state = ("scores", "kept", "_proposed")
@@ -111,7 +111,7 @@ class SelectionCurriculum(Curriculum):
         if known < self._keep:
             raise DivergedError(
                 f"on {known} of {self._candidates} candidates did an episode end within a rollout, "
-                f"so that fewer than {self._keep} have a score; longer rollouts (the horizon) may"
+                f"so fewer than {self._keep} have a score; try longer rollouts (the horizon)"
             )
         best = scored.score.sort(descending=True, stable=True)
         self.scores = best.values[: self._keep]

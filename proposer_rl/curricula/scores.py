@@ -210,11 +210,7 @@ class Scorer:
         self.plays_for = tuple(entry for entry in self.required_results if entry != "rollout")
 
     def of_outcome(
-        self,
-        student: Student,
-        outcome: TensorDictBase,
-        best: Tensor,
-        before: Tensor,
+        self, student: Student, outcome: TensorDictBase, best: Tensor, before: Tensor
     ) -> Scored:
         """Scores levels [n] by the outcome of training on them.
 

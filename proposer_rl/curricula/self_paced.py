@@ -25,34 +25,34 @@ Floats = NDArray[np.float64]
 Goal = Callable[[Floats], tuple[float, Floats]]  # a value and its gradient
 Deviation = Annotated[float, Interval(gt=0, le=2)]
 
-WIDEST = 2.0  # standard deviation, with which a Gaussian is nearly uniform in the box
-SAMPLED = 1000  # levels of the target, whose mean and deviation are taken
-SLACK = 1e-4  # of the constraints, within which a solution is taken
+WIDEST = 2.0  # standard deviation at which a Gaussian is nearly uniform in the box
+SAMPLED = 1000  # levels of the target from which its mean and deviation are estimated
+SLACK = 1e-4  # violation of the constraints at which a solution is still accepted
 
 
 class SelfPacedCurriculum(CountingCurriculum):
     """Draws levels from a Gaussian that moves towards the target's.
 
-    A level is a point of the box [-1, 1]^D that the space's coordinates span, drawn from a normal
-    distribution with independent coordinates, those within the box. After every ``episodes``
-    levels that came back, the mean and the deviations of the distribution p become those with the
-    least Kullback-Leibler divergence KL(p, target) among those with KL(p, present one) of at most
-    ``epsilon`` and an expected performance of at least ``delta`` (Klink et al. 2021, "A
-    Probabilistic Interpretation of Self-Paced Learning with Applications to Reinforcement
-    Learning", JMLR 22; Klink et al. 2020, arXiv 2004.11812, have the same with a penalty). The
-    target's Gaussian has its mean and deviations. See :func:`step_towards`.
+    A level is a point of the box [-1, 1]^D, which the space's coordinates span. Points come from a
+    normal distribution with independent coordinates, truncated to the box. After every ``episodes``
+    results, mean and deviations of the distribution p change: they minimise the Kullback-Leibler
+    divergence KL(p, target) subject to KL(p, current one) of at most ``epsilon`` and an expected
+    performance of at least ``delta`` (Klink et al. 2021, "A Probabilistic Interpretation of
+    Self-Paced Learning with Applications to Reinforcement Learning", JMLR 22; Klink et al. 2020,
+    arXiv 2004.11812, use a penalty instead). The target is represented by the Gaussian with its
+    mean and deviations. See :func:`step_towards`.
 
     Args:
         space: that has the bins.
-        target: that is to be mastered.
+        target: the distribution to master.
         target_shares: the target as shares of the bins, float [N].
         delta: least expected performance.
-        epsilon: how far the distribution moves at a step.
-        episodes: between two steps, by which performance is told.
+        epsilon: largest divergence of a step.
+        episodes: number of results between two steps, by which performance is estimated.
         start: where the mean begins, from -1 for the first to 1 for the last value of an axis, by
-            the axis's name; 0, the middle, for others.
-        deviation: standard deviation at first.
-        least_deviation: that the distribution and the target have.
+            the axis's name; 0, the middle, for other axes.
+        deviation: initial standard deviation.
+        least_deviation: smallest standard deviation of the distribution and of the target.
         measure: of performance, ``"success"`` or ``"return"``.
         rounded: see :class:`~proposer_rl.curricula.points.Points`.
 
@@ -174,7 +174,7 @@ def draw_in_box(mean: Tensor, deviation: Tensor, shares: Tensor) -> tuple[Tensor
         shares: uniform from 0 to 1, float64 [n, D].
 
     Returns:
-        Points, float64 [n, D], and densities but for one factor, float64 [n].
+        Points, float64 [n, D], and log densities up to a constant, float64 [n].
     """
     low, high = (torch.special.ndtr((end - mean) / deviation) for end in (-1.0, 1.0))
     z = torch.special.ndtri(low.lerp(high, shares))
@@ -205,14 +205,14 @@ def expected_performance(
 ) -> tuple[float, Floats]:
     """Estimates the mean performance under a Gaussian from episodes, and its gradient.
 
-    Each episode has the weight of its density in the Gaussian over that with which it was drawn;
-    weights are normalised.
+    The weight of an episode is its density in this Gaussian over the density with which it was
+    drawn; weights are normalised.
 
     Args:
         one: the Gaussian.
         points: of the episodes, [W, D].
-        log_density: with which they were drawn, but for one factor, [W].
-        reached: in them, [W].
+        log_density: log density with which the points were drawn, up to a constant, [W].
+        reached: results of the episodes, [W].
 
     Returns:
         The expectation; derivatives by the mean and by the logs of the deviations, [2 D].
@@ -238,28 +238,28 @@ def step_towards(
 ) -> tuple[Gaussian, float]:
     """Returns the Gaussian nearest to the target that is in reach and performs well enough.
 
-    The minimum of KL(p, target) over Gaussians p with KL(p, now) <= epsilon and an expected
-    performance of at least delta, by sequential quadratic programming (SciPy's SLSQP). Where none
-    within epsilon has that, the one of the best expected performance that is found.
+    Minimises KL(p, target) over Gaussians p with KL(p, now) <= epsilon and an expected performance
+    of at least delta, by sequential quadratic programming (SciPy's SLSQP). If no Gaussian within
+    epsilon performs that well, the result is the best performing one that is found.
 
     Args:
-        target: where to.
-        now: the present one.
-        points: of episodes, [W, D].
-        log_density: with which these were drawn, but for one factor, [W].
-        reached: in them, [W].
+        target: the Gaussian to approach.
+        now: the current Gaussian.
+        points: of the episodes, [W, D].
+        log_density: log density with which the points were drawn, up to a constant, [W].
+        reached: results of the episodes, [W].
         delta: least expected performance.
-        epsilon: largest divergence from the present one.
-        least: deviation of the new one.
+        epsilon: largest divergence from the current Gaussian.
+        least: smallest deviation of the new one.
 
     Returns:
-        It; the performance that is expected of it.
+        The new Gaussian, and its expected performance.
     """
     # SciPy's solvers take long to import, and no other curriculum needs them.
     from scipy.optimize import minimize
 
     size = len(now.mean)
-    # In units of the present one, where divergence from it is alike in all directions.
+    # In units of the current Gaussian, in which divergence from it is the same in all directions.
     units = np.concatenate([now.deviation, np.ones(size)])
     unit = float(reached.std()) or 1.0  # of performance
 
@@ -284,7 +284,7 @@ def step_towards(
         return -value, -slope
 
     def least_of(goal: Goal, start: Floats, *held: Goal) -> Floats:
-        """Returns where a goal is least with others not negative, or the start."""
+        """Minimises a goal while others are not negative; returns the start if that fails."""
         found = minimize(
             goal,
             start,

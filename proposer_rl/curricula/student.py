@@ -18,19 +18,9 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from proposer_rl.learning import PPO, RolloutCollector, gae
-from proposer_rl.meta.first_order import (
-    Direction,
-    LevelGradients,
-    exact_alignment,
-    exact_direction,
-)
+from proposer_rl.meta.first_order import Direction, LevelGradients, exact_alignment, exact_direction
 from proposer_rl.settings import ArgumentError
-from proposer_rl.task import (
-    DifferentiableTask,
-    Levels,
-    OptimalTask,
-    Task,
-)
+from proposer_rl.task import DifferentiableTask, Levels, OptimalTask, Task
 
 VALUE = "state_value"  # the critic's entry in a rollout
 
@@ -278,7 +268,7 @@ def values(steps: TensorDictBase) -> Tensor:
     """
     if VALUE not in steps.keys():
         raise ArgumentError(
-            f"rollout: lacks {VALUE} at each step and in next, which this curriculum needs; let a "
+            f"rollout: has no {VALUE} at each step and in next, which this curriculum needs; let a "
             "critic write it first, as GAE does, or use a score that needs no critic"
         )
     value: Tensor = steps[VALUE]

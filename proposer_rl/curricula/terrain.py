@@ -23,23 +23,23 @@ from proposer_rl.task import Space, refuse_many_bins
 class RowsCurriculum(CountingCurriculum):
     """Moves robots between rows of growing difficulty, by the rule of ``legged_gym``.
 
-    A robot whose level in row r came to at least ``upper`` gets one in row r + 1 next, one whose
-    level came to less than ``lower`` one in row r - 1, others stay; there is none below the first.
-    Whoever passes the last row gets a row drawn uniformly (Rudin et al. 2021, "Learning to Walk in
-    Minutes Using Massively Parallel Deep Reinforcement Learning", arXiv 2109.11978).
+    A robot with a result of at least ``upper`` in row r gets a level in row r + 1 next, one with a
+    result below ``lower`` a level in row r - 1, and others stay; row 0 is the lowest. After the
+    last row a robot gets a row drawn uniformly (Rudin et al. 2021, "Learning to Walk in Minutes
+    Using Massively Parallel Deep Reinforcement Learning", arXiv 2109.11978).
 
-    A robot's next level is the next one that is proposed: levels that come back queue up. Levels
-    that are proposed when the queue is empty, as at first, begin in a row from 0 to ``start``,
-    drawn uniformly. All else of a level is uniform.
+    The next rows wait in a queue, in the order in which results come back, and the next proposals
+    take them. When the queue is empty, as at first, rows from 0 to ``start`` are drawn uniformly.
+    The other parameters of a level are uniform.
 
     Args:
         space: that has the bins.
-        row: the axis whose bins are the rows; None for the one of this name or, if there is none,
-            the first.
-        start: the last of the rows to begin in, if there are so many.
-        lower: what a level comes to, below which it goes down.
-        upper: from which on it goes up.
-        measure: of what levels come to, ``"success"`` or ``"return"``.
+        row: the axis whose bins are the rows; None for the axis named ``row`` or, if there is
+            none, the first axis.
+        start: the highest row to begin in, if there are as many.
+        lower: a robot goes down if its result is below this.
+        upper: a robot goes up if its result is at least this.
+        measure: result of a level, ``"success"`` or ``"return"``.
 
     Raises:
         ArgumentError: for an unknown axis, one of a single row, or ``lower`` above ``upper``.
@@ -67,7 +67,7 @@ class RowsCurriculum(CountingCurriculum):
         axis = names.index(name)
         self._rows = sizes[axis]
         if self._rows < 2:
-            raise ArgumentError(f"row={name}: has a single row; give it bins")
+            raise ArgumentError(f"row={name}: has a single row; give the axis bins")
         refuse_many_bins(space)
         # The number of a bin is (before * rows + row) * after + rest.
         self._before, self._after = prod(sizes[:axis]), prod(sizes[axis + 1 :])
@@ -76,7 +76,7 @@ class RowsCurriculum(CountingCurriculum):
         self.required_results = ("success",) if measure == "success" else ()
         self._lower, self._upper, self._measure = lower, upper, measure
         self._last = torch.zeros(0, dtype=torch.int64)  # rows of the last batch, [n]
-        self._queue = torch.zeros(0, dtype=torch.int64)  # rows [m] of the next levels
+        self._queue = torch.zeros(0, dtype=torch.int64)  # next rows, [m]
 
     def propose(self, student: Student, count: int, rng: Streams) -> Batch:
         """Returns levels [n] in the rows that are next in the queue."""

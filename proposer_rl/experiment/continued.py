@@ -25,8 +25,8 @@ from proposer_rl.learning import PPO, Update
 from proposer_rl.streams import Streams
 from proposer_rl.task import Levels
 
-# Numbers of an observation that are kept with an episode, since pictures of tasks show where an
-# agent was; what is larger, as images, takes most of the memory.
+# Observations of up to this many numbers are kept with an episode, because pictures show where an
+# agent was; larger ones, such as images, would take most of the memory.
 FEW = 16
 
 Played = tuple[Levels, TensorDictBase]
@@ -40,20 +40,20 @@ class Queue:
     """The levels of one Solver whose episodes go on: waiting, being played, or over.
 
     Args:
-        curriculum: that proposes.
-        student: to whom.
-        like: a level of the kind, [].
+        curriculum: proposes the levels.
+        student: to whom it proposes.
+        like: a level of the task's kind, [].
         count: number P of environments.
     """
 
     def __init__(self, curriculum: Curriculum, student: Student, like: Levels, count: int) -> None:
         self.curriculum, self._student = curriculum, student
         self._ledger = Ledger({"episode": object})
-        self._at = 0  # the next id; what is from there on waits
+        self._at = 0  # the next id to play; later ones wait
         self.levels = like.unsqueeze(0).expand(count).clone()  # that are played, or set
         self._playing = [-1] * count
         self._over: dict[int, list[int]] = defaultdict(list)
-        self._most = count  # episodes that ended in an update
+        self._most = count  # episodes that ended in the last update
         self.steps = torch.zeros(count, dtype=torch.int64)  # of the present episodes
 
     def propose(self, rng: Streams) -> None:
@@ -72,7 +72,7 @@ class Queue:
 
         Args:
             envs: their places.
-            fresh: whether all begin anew, and what had been played before has no end.
+            fresh: whether all episodes begin anew, and those before are abandoned.
         """
         if fresh:
             for id in self._playing:
@@ -91,9 +91,9 @@ class Queue:
         """Records the episodes that ended.
 
         Args:
-            history: steps [P, H], of which the update's begin at ``before``.
-            before: a place in it.
-            ends: environment, and step of the update, of each end.
+            history: steps [P, H]; those of the update begin at ``before``.
+            before: a place in the history.
+            ends: environment and step within the update of each end.
         """
         begun = before - self.steps
         for env, step in ends:
@@ -139,8 +139,8 @@ class ContinuedLevels:
     """Trains K Solvers whose episodes go on, each on the levels of its own curriculum.
 
     Args:
-        curricula: that propose.
-        students: to whom.
+        curricula: one for each Solver.
+        students: to whom they propose.
         learner: PPO with ``continue_episodes``, of the Solvers in environments [K, P].
         like: a level of the task's kind, [].
     """
@@ -159,7 +159,7 @@ class ContinuedLevels:
             Queue(curriculum, student, like, learner.env.batch_size[1])
             for curriculum, student in zip(curricula, students, strict=True)
         ]
-        # What one of them needs of a rollout is kept for all.
+        # If one of them needs observations, they are kept for all.
         self._keeps_seen = any("policy_gradient_norms" in each.needs for each in curricula)
         self._history: TensorDictBase | None = None  # [K, P, H], which ends with the last update
         self._shown: list[Played | None] = [None] * len(self._queues)
@@ -168,7 +168,7 @@ class ContinuedLevels:
         """Makes one update, with actions and levels from K streams.
 
         Returns:
-            The update, and what each curriculum is to observe now.
+            The update, and the batches that each curriculum has to observe now.
         """
         for queue, rng in zip(self._queues, rngs, strict=True):
             queue.propose(rng)
@@ -213,7 +213,7 @@ class ContinuedLevels:
     def shown(self) -> list[Played]:
         """Each Solver's last observed levels, with the episodes on them.
 
-        Before anything was observed these are the levels that are played, without a step (T = 0).
+        Before the first observation these are the levels being played, without steps (T = 0).
         """
         assert self._history is not None  # after an update
         each = zip(self._shown, self._queues, self._history, strict=True)
@@ -234,7 +234,7 @@ class ContinuedLevels:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a state, and replays unfinished episodes up to where they were.
 
-        Tensors of a checkpoint are on the CPU; those that meet the learner's go to its device.
+        Tensors of a checkpoint are on the CPU; those that the learner uses move to its device.
         """
         device = self._learner.env.device
         for queue, own in zip(self._queues, state["queues"], strict=True):

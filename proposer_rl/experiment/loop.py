@@ -41,23 +41,22 @@ class Experiment:
     """Runs an experiment: improves the curricula in cycles, and trains Solvers on their levels.
 
     Args:
-        task: which measures and records.
+        task: measures and records the Solvers.
         learner: PPO of a population of K Solvers, one per seed.
-        curricula: what each of them trains on.
+        curricula: one for each Solver.
         schedule: lengths and intervals.
-        seeds: the K seeds; every draw of copy k is a function of the k-th.
-        folder: where the files go; a checkpoint in it is resumed.
-        log: receives each row of the first copy: its table, its values and its update.
+        seeds: the K seeds; every draw for Solver k is a function of the k-th.
+        folder: for the files; a run with a checkpoint in it is resumed.
+        log: receives each row of the first Solver: its table, its values and its update.
         progress: whether to draw a progress bar.
-        signals: which may ask the run to stop; None where nothing does. A curriculum whose
-            improvement takes long lets them interrupt it: see :meth:`StopSignals.check`.
-        status: which tells what the run is doing; a curriculum may tell it of the parts of an
-            improvement.
+        signals: may ask the run to stop; None for no signals. A long improvement of a curriculum
+            can be interrupted; see :meth:`StopSignals.check`.
+        status: shows what the run is doing; a curriculum may report the parts of an improvement.
 
     Raises:
         UnfitStudentError: if the task does not allow what the curriculum needs.
-        NoSuccessError: if the curriculum reads success and the task has none.
-        ValueError: if the headline is none of the task's metrics.
+        NoSuccessError: if the curriculum needs success and the task has none.
+        ValueError: if the headline is not a metric of the task.
     """
 
     def __init__(
@@ -75,22 +74,17 @@ class Experiment:
         status: Status | None = None,
     ) -> None:
         check_headline(task, schedule)
-        self.task = task
-        self.learner = learner
+        self.task, self.learner = task, learner
         self.sides = SideBySide(task, learner, curricula)
         self._continued: ContinuedLevels | None = None
         if learner.settings.continue_episodes:
             like = next(iter(task.evaluated_on.values()))[0]
             self._continued = ContinuedLevels(curricula, self.sides.students, learner, like)
-        self.schedule = schedule
-        self.seeds = list(seeds)
-        self.folder = folder
-        self.updates = 0
-        self.cycles = 0
+        self.schedule, self.seeds, self.folder = schedule, list(seeds), folder
+        self.updates, self.cycles = 0, 0
         self._tables = RunTables(task, self.seeds, folder, log)
         self._progress = progress
-        self._signals = signals or StopSignals()
-        self._status = status or Status()
+        self._signals, self._status = signals or StopSignals(), status or Status()
         self._headline: list[float] = []
         self._checkpoints = 0
         self._seconds_before = 0.0
@@ -105,9 +99,9 @@ class Experiment:
     def costs(self) -> list[dict[str, float]]:
         """The costs of each Solver so far, by name.
 
-        ``frames``: environment steps of its own training; ``curriculum_frames`` and
-        ``evaluations``: steps, and evaluations of a policy on a level, that its curriculum asked
-        for; ``seconds`` of the process.
+        ``frames`` are environment steps of its own training. ``curriculum_frames`` and
+        ``evaluations`` are environment steps and evaluated levels that its curriculum asked for.
+        ``seconds`` are those of the process.
         """
         return [
             {
@@ -126,10 +120,10 @@ class Experiment:
             The summary of the run, ready for JSON.
 
         Raises:
-            CheckpointError: if the folder's checkpoint is unusable or another experiment's.
-            DivergedError: if a number is not finite, saying where. The checkpoint before stays.
-            Interrupted: if a signal asked the run to stop; all is saved then.
-            StorageError: if the disk does not take a file.
+            CheckpointError: if the folder's checkpoint is unusable or of another experiment.
+            DivergedError: if a number is not finite, saying where. The last checkpoint stays.
+            Interrupted: if a signal asked the run to stop, after saving.
+            StorageError: if a file cannot be written.
         """
         resumed = self._resume()
         errors = Output(sys.stderr)
@@ -162,7 +156,7 @@ class Experiment:
                         self._update()
                 bar.update(self.updates - before)
             bar.set_postfix_str(self._headline_text())
-            self._log_cycle()  # after the last checkpoint: a longer schedule writes it again
+            self._log_cycle()  # after the last checkpoint, so a longer schedule writes it again
             self._measure_levels()
         return self.summary()
 
@@ -170,24 +164,15 @@ class Experiment:
         """Computes sample efficiency and cost so far from the metrics in the folder."""
         rows = read_csv(self.folder.path / "metrics.csv")
         headline, threshold = self.schedule.headline, self.schedule.threshold
-        reached = {
-            seed: next(
-                (
-                    int(row["updates"])
-                    for row in rows
-                    if row["seed"] == seed and row[headline] >= threshold - SLACK
-                ),
-                None,
-            )
-            for seed in self.seeds
-        }
+        met = [row for row in rows if row[headline] >= threshold - SLACK]
+        reached = [[int(row["updates"]) for row in met if row["seed"] == s] for s in self.seeds]
         return {
             "updates": self.updates,
             **{name: max(own[name] for own in self.costs) for name in self.costs[0]},
             "headline": headline,
             "threshold": threshold,
             # null: censored, the threshold was not reached within ``updates``
-            "updates_to_threshold": [reached[seed] for seed in self.seeds],
+            "updates_to_threshold": [next(iter(updates), None) for updates in reached],
             "final": [row for row in rows if row["updates"] == self.updates],
         }
 
@@ -196,7 +181,7 @@ class Experiment:
         spent = [student.frames for student in self.sides.students]
         logged = self._log_cycle(self._improved())
         self.cycles += 1
-        # Improving can be nearly all of a cycle's work, so it is saved at once.
+        # Improving can be most of the work of a cycle, so it is saved at once.
         spends = spent != [student.frames for student in self.sides.students]
         self._pause(due=logged or spends)
 
@@ -205,14 +190,14 @@ class Experiment:
         if not any(isinstance(each, LearnedCurriculum) for each in self.sides.curricula):
             return [{} for _ in streams]
         while True:
-            before = deepcopy(self._state())  # improving may change a curriculum's state in place
+            before = deepcopy(self._state())  # improving may change the state in place
             try:
                 self._status.tell("improving the curriculum")
                 return self.sides.improve(streams)
             except StopRequested:
                 self._save(before)
                 self._signals.deliver()
-                # A handler has returned, so the run goes on.
+                # The signal was handled and the run goes on.
                 self._restore(before)
 
     def _log_cycle(self, improved: Sequence[Mapping[str, Any]] | None = None) -> bool:
@@ -247,7 +232,7 @@ class Experiment:
             credits = [[(batch, outcome_of(rollout))] for batch, rollout in own]
             played = [(batch.levels, rollout) for batch, rollout in own]
         for _, outcome in chain(*credits):
-            outcome["return"] = outcome["return"] / self.task.reward_scale  # as performance is told
+            outcome["return"] = outcome["return"] / self.task.reward_scale  # as in performance
         self.sides.observe(credits)
         self.updates += 1
         last = self.updates == self.schedule.updates
@@ -284,12 +269,8 @@ class Experiment:
 
     def _save(self, state: State) -> None:
         self._checkpoints += 1
-        save_checkpoint(
-            self.folder.path / "checkpoints",
-            self._checkpoints,
-            state,
-            self.schedule.keep_checkpoints,
-        )
+        folder, keep = self.folder.path / "checkpoints", self.schedule.keep_checkpoints
+        save_checkpoint(folder, self._checkpoints, state, keep)
         self._saved = time.monotonic()
 
     def _state(self) -> State:
@@ -343,7 +324,7 @@ class SideBySide:
 
     Raises:
         UnfitStudentError: if the task does not allow what a curriculum needs.
-        NoSuccessError: if a curriculum reads success and the task has none.
+        NoSuccessError: if a curriculum needs success and the task has none.
     """
 
     def __init__(self, task: Task, learner: PPO, curricula: Sequence[Curriculum]) -> None:
@@ -425,13 +406,14 @@ class ScheduleSettings:
 
     Attributes:
         updates: length of the run.
-        cycle_length: updates between two improvements of the curriculum.
-        evaluate_every: updates between two rows of metrics.
-        checkpoint_every: updates between two checkpoints; one more follows every improvement.
-        checkpoint_seconds: time after which a checkpoint is due at the next update; None for no
-            such limit.
-        keep_checkpoints: how many of the newest checkpoints stay.
-        headline: the measurement that the run is summed up by.
+        cycle_length: number of updates between two improvements of the curriculum.
+        evaluate_every: number of updates between two rows of metrics.
+        checkpoint_every: number of updates between two checkpoints; another follows every
+            improvement.
+        checkpoint_seconds: time after which the next update also saves a checkpoint; None for no
+            limit.
+        keep_checkpoints: number of newest checkpoints to keep.
+        headline: the metric that sums up the run.
         threshold: sample efficiency is the first update at which the headline reaches this.
     """
 
@@ -449,8 +431,8 @@ def check_headline(task: Task, schedule: ScheduleSettings) -> None:
     """Refuses a headline that is not measured, or a threshold that it cannot reach.
 
     Raises:
-        ArgumentError: if the headline is none of the task's metrics, or a rate that is to reach
-            what no rate can.
+        ArgumentError: if the headline is not a metric of the task, or is a rate that cannot reach
+            the threshold.
     """
     headline, threshold, known = schedule.headline, schedule.threshold, list(task.metrics)
     if headline not in known:

@@ -13,7 +13,7 @@ from proposer_rl.runs.folder import RunFolder, read_table
 from proposer_rl.task import Levels, Task
 
 Log = Callable[[str, Mapping[str, Any], int], None]
-"""Receives each row of the first copy: its table, its values and its update."""
+"""A function that receives each row of the first Solver: its table, its values and its update."""
 
 RECORDED_LEVELS = 8
 LOGGED = ("metrics.csv", "training.csv", "cycles.jsonl")  # of numbers
@@ -44,10 +44,7 @@ class RunTables:
                 self._folder.append("levels.jsonl", row)
 
     def add_training(
-        self,
-        updates: int,
-        played: Sequence[tuple[Levels, TensorDictBase]],
-        metrics: TensorDictBase,
+        self, updates: int, played: Sequence[tuple[Levels, TensorDictBase]], metrics: TensorDictBase
     ) -> None:
         """Writes each Solver's metrics of an update, and a sample of its levels.
 
@@ -90,7 +87,7 @@ class RunTables:
     def log_again(self, updates: int) -> None:
         """Logs again the rows of the update from which a resumed run goes on.
 
-        A logger then drops what it has from this update on.
+        A logger then drops what it has of later updates.
 
         Raises:
             ValueError: naming the file and its line, if a table cannot be read.

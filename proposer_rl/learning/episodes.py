@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from proposer_rl.models import ActorCritic, draw_at
 
 SEEDS = 2**62
-SWEEP = 16  # steps between two checks which levels all Solvers have finished
+SWEEP = 16  # steps between two checks for levels that all Solvers have finished
 
 
 @torch.no_grad()
@@ -27,19 +27,19 @@ def play_episodes(
     """Plays one episode of each of K Solvers on each of its levels, all at once.
 
     Args:
-        agent: K Solvers, with memory or without.
-        env: of batch [K, N].
+        agent: K Solvers, with or without memory.
+        env: batch [K, N].
         max_steps: of an episode.
-        noise: of the actions, uniform numbers [T, N, ...], one for each element of an action, the
+        noise: uniform numbers [T, N, ...] to draw actions, one for each element of an action, the
             same for every Solver; None for the most probable actions.
-        remake: makes an environment [K, m] of some of the levels, int64 [m]. With it levels that
-            all Solvers have finished are left out now and then; without it they are reset, and
-            begin again without being counted.
+        remake: makes an environment [K, m] of some of the levels, int64 [m]. With it, levels that
+            all Solvers have finished are dropped now and then; without it they are reset, and
+            played again without being counted.
 
     Yields:
-        Of each step on the m levels on which some Solver may still be playing: their places among
-        all, int64 [m]; the state after it, with the reward, [K, m]; and whether it belongs to the
-        Solver's first episode there, bool [K, m].
+        For each step on the m levels on which some Solver may still be playing: their places among
+        all levels, int64 [m]; the state after the step, with the reward, [K, m]; and whether the
+        step belongs to the Solver's first episode there, bool [K, m].
     """
     device = env.device or torch.device("cpu")
     place = torch.arange(env.batch_size[1], device=device)
@@ -82,27 +82,27 @@ def mean_performance(
 ) -> TensorDict:
     """Plays episodes of K Solvers on levels; returns mean returns and shares of successes.
 
-    The random numbers are those of the levels, the same for every Solver: they differ by what they
-    do alone, and what one gets does not depend on which others are evaluated with it.
+    Every Solver gets the same random numbers for a level. So Solvers differ only in what they do,
+    and the result of one does not depend on the others.
 
     Args:
         agent: K Solvers.
         make_env: makes an environment that plays levels [K, m] from its next reset on.
-        levels: each Solver's own, [K, E].
+        levels: each Solver's levels, [K, E].
         generator: source of randomness, on the CPU.
         max_steps: of an episode.
-        episodes: played on each level.
-        greedy: whether the most probable actions are taken, or drawn ones.
-        reward_scale: of the environment's rewards, which is taken out of the returns.
-        at_once: episodes of each Solver that are played at once; None for all.
-        drop_finished: whether to make environments of fewer levels as others are finished; for
-            environments that are made in no time, and may be stepped beyond an episode's end.
+        episodes: number of episodes on each level.
+        greedy: whether to take the most probable actions instead of drawing them.
+        reward_scale: of the environment's rewards, by which the returns are divided.
+        at_once: number of episodes of each Solver that are played at once; None for all.
+        drop_finished: whether to drop finished levels by making smaller environments; for
+            environments that are cheap to make, and may be stepped beyond an episode's end.
 
     Returns:
         ``return`` and ``success``, float32 [K, E].
     """
     count = levels.batch_size[1]
-    if count == 0:  # of which there is no environment
+    if count == 0:  # there is no environment of no levels
         empty = torch.zeros(levels.batch_size)
         return TensorDict({"return": empty, "success": empty.clone()}, levels.batch_size)
     # Played in parts, the episodes of a level belong together.

@@ -1,10 +1,10 @@
 """Replays functions of tensordicts as CUDA graphs, with tensordict's ``CudaGraphModule``.
 
-Thousands of small kernels cost a GPU less time than it takes Python to ask for them one by one; a
-graph asks for all of them at once. It repeats kernels on the memory that they were recorded with
-and runs no Python. So a function that is recorded reads nothing back from the device, and what it
-reads and changes besides its inputs (weights, an optimiser's state, the levels that an environment
-plays) stays where it is.
+Launching thousands of small kernels one by one from Python takes longer than running them; a graph
+launches all of them at once. It repeats the recorded kernels on the recorded memory and runs no
+Python. So a recorded function must read nothing back from the device, and everything it reads and
+changes besides its inputs (weights, the state of an optimiser, the levels of an environment) must
+stay in the same memory.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torch.utils._pytree import tree_leaves
 
 from proposer_rl.settings import ArgumentError
 
-WARM_UPS = 2  # calls of the function itself, in the last of which it is recorded
+WARM_UPS = 2  # calls before replaying; the last of them is recorded
 
 
 class GraphError(ArgumentError):
@@ -42,31 +42,30 @@ def replayed(function: Callable[..., TensorDictBase]) -> Callable[..., TensorDic
     """Wraps a function so that a GPU replays it from the third call on, with the same results.
 
     Args:
-        function: from a tensordict, and further objects, which are the same in every call, to a
-            tensordict. All inputs keep their shapes.
+        function: from a tensordict, and further objects that are the same in every call, to a
+            tensordict. Inputs must keep their shapes.
 
     Returns:
-        A function that returns new tensors each time. It raises a GraphError where it cannot be
-        recorded.
+        A function that returns new tensors each time. It raises a GraphError if the function cannot
+        be recorded.
     """
     with warnings.catch_warnings():
-        # Tensordicts are no pytrees from here on, which nothing here takes them for.
+        # CudaGraphModule changes how pytrees treat tensordicts, which nothing here relies on.
         warnings.filterwarnings("ignore", message="Tensordict is registered in PyTree")
         logging.getLogger("tensordict").setLevel(logging.WARNING)  # a line for each graph
         module = CudaGraphModule(function, warmup=WARM_UPS, in_keys=[])
 
     def call(inputs: TensorDictBase, *others: object) -> TensorDictBase:
         if module.counter < WARM_UPS:
-            # It keeps the inputs that it records, which later replays write over, and so would what
-            # came of them.
+            # Replays overwrite the recorded inputs and outputs, so both are copied here.
             try:
                 with _no_garbage():
                     return module(inputs.clone(), *others).clone()
             except RuntimeError as error:
                 name, why = getattr(function, "__qualname__", function), str(error).split("\n")[0]
                 raise GraphError(
-                    f"graphs=True: {name} cannot be recorded as a CUDA graph, graphs=False does "
-                    f"without: {why}"
+                    f"graphs=True: {name} cannot be recorded as a CUDA graph; set graphs=False "
+                    f"({why})"
                 ) from error
         return module(inputs, *others)
 
@@ -90,8 +89,8 @@ class ReplayedOfAgents:
     """Records a function of an agent and levels once for each agent and each size.
 
     Args:
-        function: of an agent, of levels where there are any, and of what has no say in the result,
-            such as a generator that nothing is drawn from.
+        function: of an agent, of levels if there are any, and of arguments that do not affect the
+            result, such as a generator that is not used.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -105,7 +104,7 @@ class ReplayedOfAgents:
         graphs = self._graphs.setdefault(agent, {})
         if size not in graphs:
             graphs[size] = replayed(self._apply)
-        # The agent is no part of what is recorded, and so is not kept alive by it.
+        # The agent is not part of the recording, which therefore does not keep it alive.
         return graphs[size](inputs, agent, *given[1:])["result"]
 
     def _apply(self, inputs: TensorDictBase, agent: Any, *others: Any) -> TensorDictBase:

@@ -1,8 +1,8 @@
 """PPO's settings, advantages, loss and gradients for K replicas at once.
 
-All of it is TorchRL's, without what would mix replicas or wait for a device; what is reported of a
-step is of each replica by itself, and refused where it is not finite. A rule that joins several
-settings stands where the object is built that needs it.
+All of it is TorchRL's, except for parts that would mix replicas or wait for a device. Metrics are
+reported for each replica by itself, and numbers that are not finite raise an error. Rules that join
+several settings are checked where the object that needs them is built.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torchrl.objectives.value.functional import reward2go
 from proposer_rl.models import ActorCritic
 from proposer_rl.settings import settings
 
-LEAST_DISCOUNT = 1e-7  # below it, float32 does not know the next reward from none
+LEAST_DISCOUNT = 1e-7  # below this the next reward vanishes in float32
 
 
 @settings
@@ -32,15 +32,15 @@ class LearningSettings:
     """PPO's numbers except the horizon; the defaults are the paper's for the Solver.
 
     Attributes:
-        updates: updates on one batch; each computes advantages anew, then runs ``epochs``.
-        epochs: passes of an update through its batch, each a gradient step where the batch is not
-            cut in parts.
+        updates: number of updates on one batch; each recomputes advantages, then runs ``epochs``.
+        epochs: passes of an update through its batch; each is one gradient step unless the batch is
+            cut into minibatches.
         learning_rate, adam_eps: Adam's step size and denominator offset.
         gamma, lmbda: discount, and GAE's weight of longer returns (Schulman et al. 2016, eq. 16).
         clip_epsilon: the ratio is clipped to 1 +- this (Schulman et al. 2017, eq. 7).
         entropy_coeff, critic_coeff: weights of the entropy bonus and of the squared value error.
         max_grad_norm: largest gradient norm of one copy.
-        normalize_advantage: standardise advantages over what a gradient step of a copy is made on.
+        normalize_advantage: whether to standardise advantages within each gradient step of a copy.
     """
 
     updates: Annotated[int, Ge(1)] = 1
@@ -62,19 +62,19 @@ class PPOSettings(LearningSettings):
 
     Attributes:
         horizon: steps T collected from every environment before an update.
-        continue_episodes: whether episodes go on from rollout to rollout, and a new level begins
-            where one ends; otherwise every rollout begins with its levels.
-        normalize_observations: whether observations are standardised by the mean and the standard
-            deviation of all that a replica has trained on, and clipped to [-10, 10].
+        continue_episodes: whether episodes go on from rollout to rollout, so that a new level
+            begins when an episode ends; otherwise every rollout begins with new levels.
+        normalize_observations: whether to standardise observations by the mean and the standard
+            deviation of all that a replica has trained on, and clip them to [-10, 10].
         normalize_rewards: whether values are in units of the standard deviation of the discounted
             return, which is the same as dividing rewards by it.
-        minibatches: equal parts of a batch, shuffled anew in each epoch, with a gradient step (and
-            standardised advantages) each; 1 for the batch as it is.
-        anneal_updates: the learning rate falls in equal steps, update by update, and would be zero
-            after so many; None for a constant one.
+        minibatches: number of equal parts of a batch, shuffled in each epoch, with a gradient step
+            (and standardised advantages) each; 1 for the whole batch.
+        anneal_updates: the learning rate falls linearly, update by update, to zero after this many
+            updates; None for a constant one.
         anneal_clip: whether ``clip_epsilon`` falls with the learning rate.
-        clip_value: the value's loss is the larger of its squared error and that of the value
-            clipped to this distance from the rollout's; None for the plain squared error.
+        clip_value: the loss of the value is the larger of two squared errors: its own, and that of
+            the value clipped to this distance from the rollout's; None for the plain squared error.
     """
 
     horizon: Annotated[int, Ge(1)] = 25
@@ -92,7 +92,7 @@ class SolverSettings:
     """Settings of the Solver's training.
 
     Attributes:
-        batch_size: levels P of an update.
+        batch_size: number P of levels in an update.
         ppo: PPO's numbers.
     """
 
@@ -102,17 +102,17 @@ class SolverSettings:
 
 def gae(gamma: float, lmbda: float) -> GAE:
     """Makes TorchRL's generalised advantage estimation for rollouts that contain values."""
-    # Its vectorised form splits the batch where episodes end, which it has to look up.
+    # The vectorised form splits the batch at the ends of episodes, and would wait for the device.
     return GAE(gamma=gamma, lmbda=lmbda, value_network=None, vectorized=False)
 
 
 class LeaveOneOutBaseline(TensorDictModuleBase):
     """Computes advantages as returns minus the mean return of the other replicas.
 
-    Where all K episodes start from one state, the others' mean return is an unbiased estimate of
-    that state's value, and a far better one than a critic that has seen a few episodes
-    (Kool et al. 2019, "Buy 4 REINFORCE samples, get a baseline for free!", eq. 8). It takes the
-    place of :class:`torchrl.objectives.value.GAE`: the returns are the critic's targets.
+    If all K episodes start from the same state, the mean return of the others is an unbiased
+    estimate of that state's value, and a far better one than a critic has after a few episodes
+    (Kool et al. 2019, "Buy 4 REINFORCE samples, get a baseline for free!", eq. 8). It replaces
+    :class:`torchrl.objectives.value.GAE`; the returns are the targets of the critic.
 
     Args:
         gamma: discount.
@@ -138,8 +138,8 @@ class LeaveOneOutBaseline(TensorDictModuleBase):
         """Writes ``advantage`` and ``value_target``, [K, T, 1], into a rollout [K, T]."""
         copies = tensordict.batch_size[0]
         reward = tensordict["next", "reward"]
-        # TorchRL's sum breaks off where a power of the discount is lost in rounding: here before
-        # the first term.
+        # TorchRL's sum stops where a power of the discount is lost in rounding: here before its
+        # first term.
         following = reward.clone()
         if self.gamma >= LEAST_DISCOUNT:
             following = reward2go(reward, tensordict["next", "done"], self.gamma)
@@ -149,7 +149,7 @@ class LeaveOneOutBaseline(TensorDictModuleBase):
 
 
 ACTED_VALUE = "acted_value"
-"""Entry of the values that the critic had when it acted, which a clipped value loss compares to."""
+"""Entry of the values at the time of acting, which a clipped value loss needs."""
 
 # From an actor and a critic that read what stands in a tensordict already, to a loss of both.
 MakeLoss = Callable[[TensorDictModuleBase, TensorDictModule], LossModule]
@@ -159,7 +159,7 @@ def make_loss(make: MakeLoss, agent: ActorCritic) -> LossModule:
     """Makes the loss of an agent's actor and critic from the entries that the agent writes.
 
     Raises:
-        ValueError: if it reduces what belongs to different replicas.
+        ValueError: if the loss averages over replicas.
     """
     loss = make(*agent.readout())
     if loss.reduction != "none":
@@ -170,7 +170,7 @@ def make_loss(make: MakeLoss, agent: ActorCritic) -> LossModule:
 class CopiesClipLoss(ClipPPOLoss):
     """PPO's clipped loss of every transition, with advantages standardised for each replica.
 
-    ``entropy``, ``kl_approx`` and ``clip_fraction`` are of every transition, too, where TorchRL's
+    ``entropy``, ``kl_approx`` and ``clip_fraction`` are of every transition, too, while TorchRL's
     are means over all replicas.
 
     ``numbers`` are further arguments of :class:`torchrl.objectives.ClipPPOLoss`.
@@ -191,12 +191,12 @@ class CopiesClipLoss(ClipPPOLoss):
             normalize_advantage_exclude_dims=() if copies is None else (0,),
             functional=False,
             reduction="none",
-            # TorchRL's takes the variance over the first dimension alone: see explained_variance.
+            # TorchRL takes the variance over the first dimension only: see explained_variance.
             log_explained_variance=False,
             **numbers,
         )
         if numbers.get("clip_value") is not None:
-            # TorchRL asks its tensor whether it is zero, and waits.
+            # TorchRL checks whether its tensor is zero, and would wait for the device.
             del self._buffers["clip_value"]
             self.clip_value = numbers["clip_value"]
 
@@ -223,7 +223,7 @@ class CopiesClipLoss(ClipPPOLoss):
         return target_return, state_value, self._acted_value
 
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
-        # TorchRL's checks that an entropy is finite, and waits: for discrete actions it is.
+        # TorchRL checks that entropies are finite, and would wait; for discrete actions they are.
         if isinstance(dist, Categorical | Independent):
             entropy = dist.entropy().unsqueeze(-1)
         else:
@@ -256,7 +256,7 @@ def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int
     if copies is None:
         return nn.utils.clip_grad_norm_(parameters, max_norm)
     gradients = [p.grad for p in parameters if p.grad is not None]
-    # Slice by slice, since a norm over a row of several is rounded otherwise than over one alone.
+    # Slice by slice, because a norm over several rows is rounded differently from one row's.
     slices = [gradient[k] for k in range(copies) for gradient in gradients]
     norms = torch.stack(torch._foreach_norm(slices)).view(copies, len(gradients))
     norm = norms.square().sum(1).sqrt()  # [K]
@@ -267,7 +267,7 @@ def clip_gradients_(parameters: list[nn.Parameter], max_norm: float, copies: int
 
 
 class DivergedError(ArithmeticError):
-    """A number is not finite; the message is one line that says which, and in which replica."""
+    """A number is not finite; the message is one line that says which and in which replica."""
 
     exit_code = 3
 
@@ -282,16 +282,16 @@ def require_finite(
     """Checks that an update is finite; reads one number from the device if all is well.
 
     Args:
-        reward: of the rollout, [B, ...], B the first dimension of the environment.
-        steps: of S gradient steps, [S], the losses ``loss_...`` and the ``grad_norm`` of each
-            replica, [S, K], or without replicas [S].
+        reward: of the rollout, [B, ...], with B the first dimension of the environment.
+        steps: losses ``loss_...`` and ``grad_norm`` of S gradient steps, [S, K], or without
+            replicas [S].
         weights: after the update, by name, [K, ...] with replicas.
         copies: K, or None for a single network.
-        first: number of the first replica, by which replicas are named.
+        first: number of the first replica, for naming replicas.
 
     Raises:
         DivergedError: naming what was not finite first, and the replicas that it happened in. The
-            others are as they would be without it: nothing is shared between replicas.
+            other replicas are not affected, because nothing is shared between them.
     """
     # What a gradient step leaves behind, in the order in which it arises.
     names = [*(key for key in steps.keys() if key.startswith("loss_")), "grad_norm"]

@@ -5,10 +5,11 @@ on all of it or on shuffled parts of it, on
 
     - min(r A, clip(r, 1 - eps, 1 + eps) A)  +  critic_coeff (V - R)^2  -  entropy_coeff H
 
-with r the new over the old probability of an action, V the critic's value, R its target and H the
-policy's entropy (Schulman et al. 2017, eq. 7 and 9). TorchRL computes all of it. What is added: the
-level's context is computed once per rollout and once per gradient step, and K replicas train in one
-leading dimension as if each were alone. Nothing in an update reads a number from the device.
+with r the ratio of the new to the old probability of an action, V the critic's value, R its target
+and H the policy's entropy (Schulman et al. 2017, eq. 7 and 9). TorchRL computes all of this. This
+module adds two things: the context of a level is computed once per rollout and once per gradient
+step, and K replicas train along one leading dimension as if each were alone. An update reads no
+number from the device.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from proposer_rl.learning.training_batch import Minibatches, Statistics
 from proposer_rl.models import ActorCritic, Population, one_copy
 
 VALUES = ("state_value", ("next", "state_value"))
-DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # beside the terms, where a loss has them
+DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # besides the terms, if a loss has them
 
 
 class Update(NamedTuple):
@@ -47,17 +48,17 @@ class PPO:
     Args:
         env: batch [*B]; with replicas, B = [K, ...]. Entries that the agent's encoder reads must
             stay the same until the environment is reset.
-        agent: the actor-critic; its ``copies`` says whether the first batch dimension holds
-            independent replicas, which decides over what losses, advantages and norms are taken.
+        agent: the actor-critic; if it has ``copies``, the first batch dimension holds independent
+            replicas, each with its own losses, standardised advantages and gradient norm.
         settings: PPO's numbers.
         advantage: writes ``advantage`` and ``value_target`` into a rollout with values; None for
             TorchRL's :class:`~torchrl.objectives.value.GAE`.
-        loss: makes another TorchRL loss of the agent's actor and critic, with
-            ``functional=False`` and ``reduction="none"``, whose terms ``loss_...`` are added up;
-            None for :class:`~torchrl.objectives.ClipPPOLoss`.
+        loss: makes another TorchRL loss from the agent's actor and critic, with
+            ``functional=False`` and ``reduction="none"``; its terms ``loss_...`` are summed. None
+            for :class:`~torchrl.objectives.ClipPPOLoss`.
 
     Raises:
-        ValueError: if the loss reduces what belongs to different replicas.
+        ValueError: if the loss averages over replicas.
 
     Example:
         A linear policy and value for one environment of Gymnasium's:
@@ -124,8 +125,8 @@ class PPO:
         """Acts for one horizon, from a reset unless episodes go on.
 
         Args:
-            generators: one for each index of the environment's first dimension, from which its
-                actions are drawn; None for torch's default generator.
+            generators: one for each index of the environment's first dimension, to draw actions;
+                None for torch's default generator.
 
         Returns:
             A complete TorchRL rollout [*B, T]: observations (those of the level expanded along
@@ -156,13 +157,13 @@ class PPO:
 
         Args:
             rollout: complete.
-            generators: as of :meth:`collect`; minibatches are shuffled by them.
+            generators: as in :meth:`collect`; they shuffle minibatches.
 
         Returns:
-            Of each replica [K], without replicas [], means over its batch and the gradient steps:
-            the loss's weighted terms, for PPO ``loss_objective``, ``loss_entropy`` and
-            ``loss_critic``; ``entropy``, ``kl_approx`` and ``clip_fraction``, where the loss has
-            them; ``explained_variance``, ``grad_norm``.
+            Means over the batch and the gradient steps, for each replica [K], without replicas []:
+            the weighted terms of the loss, which for PPO are ``loss_objective``, ``loss_entropy``
+            and ``loss_critic``; ``entropy``, ``kl_approx`` and ``clip_fraction`` if the loss has
+            them; ``explained_variance`` and ``grad_norm``.
         """
         level = rollout.select(*self.agent.level_keys)[..., 0]
         first = not self._gradient_steps
@@ -183,8 +184,8 @@ class PPO:
         """Makes S gradient steps on the ``steps`` [*B, T] of a batch with their ``level`` [*B].
 
         Returns:
-            ``gradient_steps`` [S] or [S, K], the metrics of each; and of the ``steps`` what is
-            computed here: values, advantages and targets.
+            ``gradient_steps`` [S] or [S, K], the metrics of each; and ``steps`` with the values,
+            advantages and targets that were computed.
         """
         steps, level = batch["steps"].copy(), batch["level"]
         taken = []
@@ -202,7 +203,7 @@ class PPO:
         return TensorDict({"steps": computed, "gradient_steps": TensorDict.stack(taken)})
 
     def _gradient_step(self, steps: TensorDictBase, level: TensorDictBase) -> TensorDict:
-        with set_recurrent_mode(True):  # an agent with memory goes through the whole rollout again
+        with set_recurrent_mode(True):  # agents with memory go through the whole rollout again
             loss, metrics = self._forward(steps, level)
         self._adam.zero_grad()
         loss.backward()  # each replica's gradient is its own
@@ -236,7 +237,7 @@ class PPO:
     def compile(self) -> PPO:
         """Compiles the computation of gradient steps with torch.compile, for a GPU.
 
-        The first step takes half a minute and more, and numbers are rounded otherwise.
+        The first step takes half a minute or more, and numbers are rounded differently.
 
         Returns:
             Itself.
@@ -244,7 +245,7 @@ class PPO:
         for module in self.agent.modules():
             if isinstance(module, Population):
                 module.prefer_products()
-        # Every learner of a process is a case of its own, and after eight it would be given up.
+        # Each learner of a process is compiled anew, and after eight torch would give up.
         torch._dynamo.config.recompile_limit = 256
         self._forward = torch.compile(self._forward, dynamic=False)  # type: ignore[method-assign]
         return self
@@ -253,8 +254,8 @@ class PPO:
         """Replays training on a GPU as a CUDA graph from now on, with the same numbers.
 
         Args:
-            rollouts: whether acting is replayed, too. The environment then reads nothing back from
-                the device, and new levels come to where the old ones were.
+            rollouts: whether to replay acting, too. The environment then must read nothing back
+                from the device, and put new levels in the memory of the old ones.
 
         Returns:
             Itself.
@@ -301,10 +302,8 @@ class PPO:
 class Replica:
     """A view of one of K replicas, to be evaluated as if it were alone.
 
-    Its agent lies in the memory of theirs.
-
     Attributes:
-        agent: with one copy, which changes as they are trained.
+        agent: with one copy, in the memory of the learner's agent, so it changes in training.
         settings: PPO's numbers.
     """
 
@@ -320,8 +319,8 @@ class Replica:
 def complete_adam(parameters: Sequence[nn.Parameter], learning_rate: float, eps: float) -> Adam:
     """Makes Adam with its state, which torch would make at the first step.
 
-    On a GPU its learning rate is a tensor there, so that a graph of its steps reads what it is set
-    to (:func:`set_learning_rate`).
+    On a GPU the learning rate is a tensor there, so that a recorded graph reads the value that
+    :func:`set_learning_rate` sets.
     """
     rate: float | Tensor = learning_rate
     on_gpu = parameters[0].is_cuda
@@ -367,12 +366,12 @@ def restore_snapshot(agent: ActorCritic, adam: Adam, snapshot: TensorDictBase) -
         The number of Adam's steps so far.
 
     Raises:
-        ValueError: if it is of another network, or its replicas differ in Adam's steps.
+        ValueError: if it belongs to another network, or its replicas differ in Adam's steps.
     """
     load_agent(agent, snapshot)
     parameters = dict(agent.named_parameters())
     steps = torch.stack([snapshot[name, "step"].flatten() for name in parameters])
-    # The one question here that waits for the device.
+    # The only line here that waits for the device.
     if not bool((steps == steps[:, :1]).all()):
         raise ValueError("the snapshot's copies have made different numbers of Adam steps")
     for name, parameter in parameters.items():

@@ -24,17 +24,18 @@ class RolloutCollector:
     """Collects rollouts that begin with a reset, or go on with the episodes of the last one.
 
     Args:
-        env: batch [*B]. What the agent's encoder reads must stay the same until its next reset.
-        agent: that acts.
-        horizon: steps T of a rollout.
-        continued: whether episodes go on from rollout to rollout, with an agent's memory of them.
+        env: batch [*B]. Entries that the agent's encoder reads must not change until the next
+            reset.
+        agent: acts in it.
+        horizon: number T of steps of a rollout.
+        continued: whether episodes go on from rollout to rollout, and with them an agent's memory.
 
     Attributes:
-        episodes: the environment as one whose episodes go on; None where they do not.
+        episodes: the environment whose episodes go on; None if they do not.
         memory: of an agent whose episodes go on, batch [*B]; None before the first rollout.
 
     Raises:
-        ArgumentError: if the agent reads its level once per rollout, and episodes are to go on.
+        ArgumentError: if episodes go on, and the agent reads its level once per rollout.
     """
 
     def __init__(
@@ -43,7 +44,7 @@ class RolloutCollector:
         if continued and agent.level_keys:
             raise ArgumentError(
                 "continue_episodes=True: this Solver reads its level once for a whole rollout; "
-                "leave False"
+                "leave it False"
             )
         self.episodes = ContinuedEpisodes(env) if continued else None
         self.memory: TensorDictBase | None = None
@@ -102,15 +103,15 @@ class RolloutCollector:
 class ContinuedEpisodes(TransformedEnv):
     """Lets episodes go on where a collector resets, after the first time.
 
-    An episode begins where another has ended, on the level that is set by then. Levels can be set
-    at any time, or they are asked of ``next_levels``.
+    A new episode begins when another has ended, on the level that is set at that time. Levels can
+    be set from outside at any time, or ``next_levels`` provides them.
 
     Args:
-        env: of batch [*B], which keeps a level until the next reset.
+        env: batch [*B]; it must keep a level until the next reset.
 
     Attributes:
-        next_levels: called where episodes begin, with whose they are, bool [*B]: the levels [*B]
-            that are set then. None where levels are set from outside.
+        next_levels: called when episodes begin, with bool [*B], which of them; returns the levels
+            [*B] to set. None if levels are set from outside.
     """
 
     def __init__(self, env: EnvBase) -> None:
@@ -139,12 +140,12 @@ class ContinuedEpisodes(TransformedEnv):
     def stand(self, levels: Any, actions: Tensor, steps: Tensor) -> None:
         """Replays actions until episodes on levels [*B] are where they were interrupted.
 
-        An environment that does the same after the same actions then stands where that one did.
+        The environment must be deterministic given level and actions.
 
         Args:
-            levels: that they are on.
-            actions: the last ones of each, [*B, T, ...].
-            steps: how many of them belong to its episode, int64 [*B].
+            levels: of the episodes.
+            actions: the last actions of each environment, [*B, T, ...].
+            steps: how many of them belong to the unfinished episode, int64 [*B].
         """
         longest = int(steps.max())
         self.base_env.set_levels(levels)
@@ -154,7 +155,7 @@ class ContinuedEpisodes(TransformedEnv):
             if left < longest and bool(begins.any()):
                 state = self.base_env.reset(state.set("_reset", begins.unsqueeze(-1)))
             if left:
-                # Those that have not begun play as well: it does not matter where they are.
+                # Episodes that have not begun play as well, without effect.
                 state.set("action", actions.select(steps.ndim, -left))
                 _, state = self.base_env.step_and_maybe_reset(state)
         self._standing = state.copy()
@@ -183,8 +184,8 @@ def set_values(agent: ActorCritic, steps: TensorDictBase, level: TensorDictBase)
 def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDictBase) -> None:
     """Writes the values after each of the steps [*B, T], given the context of their level [*B].
 
-    The agent has the memory that is there after each step. Where an episode goes on, the value is
-    that before the next step; an agent that reads each step by itself does not compute it again.
+    Values use the memory after each step. If an episode goes on, the value after a step is the
+    value before the next one, which an agent that reads each step by itself does not compute again.
     """
     after, value = steps.get("next").select(*agent.step_keys), steps.get("state_value")
     if agent.level_keys or not population.at_hand(value):  # to count is to wait
@@ -194,7 +195,7 @@ def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDi
     unknown = steps.get(("next", "done")).squeeze(-1).clone()
     unknown[..., -1] = True
     unknown = unknown.reshape(shape)
-    # As many of each replica as of that which has most: those that are known come out the same.
+    # Every replica computes as many as the one with most; known values come out the same.
     most = int(unknown.sum(1).max())
     which = unknown.byte().argsort(dim=1, descending=True, stable=True)[:, :most]
     rows = (torch.arange(len(which)).unsqueeze(1), which)
@@ -209,12 +210,12 @@ def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDi
 class RolloutPolicy(TensorDictModuleBase):
     """The policy of the collector: reads steps off the context and acts by given noise.
 
-    It carries an agent's memory from step to step; the agent itself forgets where an episode ends.
-    :meth:`begin` comes before every rollout.
+    It carries an agent's memory from step to step; the agent itself resets it when an episode ends.
+    Call :meth:`begin` before every rollout.
 
     Args:
-        agent: its parameters do not become the policy's, so that a collector leaves them be.
-        level: where a reset puts the level aside; None where it stays in every step.
+        agent: hidden from nn.Module, so that a collector does not touch its parameters.
+        level: keeps the level that a reset set aside; None if the level stays in every step.
     """
 
     context: TensorDictBase
@@ -233,7 +234,7 @@ class RolloutPolicy(TensorDictModuleBase):
 
         Args:
             noise: uniform numbers in [0, 1), [T, ...], one for each element of T actions.
-            memory: of the episodes that go on, [*B]; None where all of them begin.
+            memory: of episodes that go on, [*B]; None if all begin.
         """
         self._steps = enumerate(noise)
         self._before = memory

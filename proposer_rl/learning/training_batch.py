@@ -19,19 +19,19 @@ from proposer_rl.settings import ArgumentError
 class Minibatches:
     """Cuts rollouts into minibatches of shuffled steps or sequences.
 
-    They are whole sequences where an agent has a memory, which goes through them, or an encoder,
+    Whole sequences are shuffled if the agent has a memory, which goes through them, or an encoder,
     which reads a level once for all of its steps.
 
     Args:
-        agent: that trains.
-        batch_size: of its environment, [*B], whose first dimension are the replicas if there are.
+        agent: trains on them.
+        batch_size: of its environment, [*B], whose first dimension are the replicas, if any.
         settings: PPO's numbers.
 
     Attributes:
-        steps: of the smallest part, of one replica.
+        steps: number of steps of one replica in the smallest minibatch.
 
     Raises:
-        ArgumentError: if there are more parts than steps or sequences.
+        ArgumentError: if there are more minibatches than steps or sequences.
     """
 
     def __init__(self, agent: ActorCritic, batch_size: torch.Size, settings: PPOSettings) -> None:
@@ -52,7 +52,7 @@ class Minibatches:
     def draw(self, generators: Sequence[torch.Generator] | None) -> dict[str, Tensor]:
         """Draws the orders of an update's epochs by entry name: int64 [K, N] or [N].
 
-        Replica k's come from the k-th generator; without any, from torch's default one.
+        Replica k draws from the k-th generator, or without generators from torch's default one.
         """
         settings, copies = self._settings, self._agent.copies
         if settings.minibatches == 1:
@@ -72,7 +72,7 @@ class Minibatches:
     ) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
         """Yields the minibatches of steps [*B, T] in an epoch's order, each with its level.
 
-        Without an order that is all of it as it is.
+        Without an order it yields the whole batch unchanged.
         """
         if order is None:
             yield steps, level
@@ -104,15 +104,15 @@ class Minibatches:
 class Statistics:
     """Keeps the running moments by which an agent's observations and values are normalised.
 
-    Observations that a rollout has are taken in after it has been trained on, so that training
-    begins with the policy that acted; those of the very first one before, since until then there
-    are none. Rewards are taken in before, and the rollout's values are put into the new unit.
+    Observations of a rollout update the moments after training on it, so that training begins with
+    the policy that acted; those of the very first rollout come before, because there are no moments
+    yet. Rewards update the moments before training, and the values of the rollout are rescaled.
 
-    It sets the agent's ``normalization``, to None where the settings ask for none.
+    It sets the agent's ``normalization``, to None if the settings ask for none.
 
     Attributes:
-        discounted: rewards so far of episodes that go on, discounted, float64 [*B]; None where
-            all begin.
+        discounted: discounted rewards so far of episodes that go on, float64 [*B]; None if all
+            begin.
 
     Raises:
         ArgumentError: if the agent reads its level once for a whole rollout.
@@ -125,7 +125,7 @@ class Statistics:
             if getattr(settings, name) and agent.level_keys:
                 raise ArgumentError(
                     f"{name}=True: this Solver reads its level once for a whole rollout; "
-                    "leave False"
+                    "leave it False"
                 )
         shapes = {}
         if settings.normalize_observations:
@@ -143,7 +143,7 @@ class Statistics:
     def before(self, rollout: TensorDictBase, level: TensorDictBase, *, first: bool) -> None:
         """Updates the moments of rewards by a rollout [*B, T], and rescales its values.
 
-        In the first one, before which nothing was trained on, observations come first.
+        The first rollout also updates the moments of observations.
         """
         agent, normalization = self._agent, self._agent.normalization
         if normalization is None:

@@ -1,6 +1,6 @@
 """Turns the Proposer's actions into bins: one of N for each of P levels.
 
-A bin is a number, whatever it stands for; the task's space turns bins into levels.
+A bin is a number; the space of the task turns bins into levels.
 """
 
 from __future__ import annotations
@@ -47,13 +47,12 @@ class Actions(ABC):
     ) -> tuple[Any, Tensor]:
         """Draws levels [K, P] for actions [K, ...]; returns them and their bins int64 [K, P].
 
-        Both are drawn on the host, where level generators work; the device meanwhile finishes what
-        it has to do.
+        Both are drawn on the host, where level generators work, while the device finishes its work.
 
         Args:
             action: of K students.
             batch_size: number P of levels.
-            streams: of each student, from which its bins and levels are drawn.
+            streams: of each student, to draw its bins and levels.
         """
         draws, levels = (
             [stream.generator(purpose) for stream in streams] for purpose in ("choices", "levels")
@@ -65,8 +64,8 @@ class Actions(ABC):
 class ProblemChoices(Actions):
     """Lets an action name the bin of every level: int64 [K, P] (the paper's Proposer, section 4).
 
-    The P draws are independent, so that all batches of one policy look alike: the composition of
-    a batch varies by about 1 / sqrt(P) only.
+    The P draws are independent, so all batches of one policy look alike: the composition of a batch
+    only varies by about 1 / sqrt(P).
 
     Example:
         Until levels are generated, only the number of the space's bins matters:
@@ -91,15 +90,15 @@ class ProblemChoices(Actions):
 class Mixture(Actions):
     """Lets an action be a mixture of bins from which the whole batch is drawn.
 
-    Action a, float [K, D], stands for the mixture softmax(a @ directions), [K, N]: the zero action
-    is the uniform one. Batches of one policy really differ then, and what the Solver gained can be
-    credited to the mixture that it trained on. The draws are :func:`systematic_draw`.
+    Action a, float [K, D], stands for the mixture softmax(a @ directions), [K, N]; the zero action
+    is uniform. With mixtures the batches of one policy really differ, so the Solver's gain can be
+    credited to the mixture. Bins are drawn by :func:`systematic_draw`.
 
     Args:
         space: the bins, and the levels in them.
         directions: what each of D numbers adds to the log-shares of N bins, float [D, N]; None for
-            the space's coordinates, so that a number says how much more of one end of an axis there
-            is. The identity (D = N) makes every mixture possible; fewer are learnt faster.
+            the space's coordinates, so that a number shifts the mixture towards one end of an axis.
+            The identity (D = N) makes every mixture possible; fewer numbers are learnt faster.
 
     Example:
         Three bins along one axis, and an action that prefers its upper end:

@@ -52,17 +52,17 @@ class ProposerSettings:
     """Settings of a Proposer and its meta-environment; the defaults learn best, unlike the paper's.
 
     Attributes:
-        rollouts: number K of replicas of the Solver that are trained side by side.
-        meta_episode_length: updates L of a meta-episode.
-        action_repeat: updates for which an action holds; divides L.
-        validation_levels: size E of the batch that the gain is measured on.
-        probe_levels: number C of target levels through which the Solver is seen.
-        observes: numbers that are observed beside the probes.
-        action: what an action means.
-        own_action: what the Solver itself trains on: a sample of the policy or its mode.
-        advantage: against the mean of the other replicas, or by a critic.
+        rollouts: number K of replicas of the Solver that train side by side.
+        meta_episode_length: number L of updates in a meta-episode.
+        action_repeat: number of updates for which an action holds; divides L.
+        validation_levels: number E of levels on which the gain is measured.
+        probe_levels: number C of target levels on which the Proposer sees the Solver's outputs.
+        observes: numbers that the Proposer observes besides the probes.
+        action: meaning of an action.
+        own_action: action for the Solver itself: a sample of the policy or its mode.
+        advantage: relative to the mean of the other replicas, or by a critic.
         context, hidden: widths of the network.
-        ppo: PPO's numbers; the horizon is the number of actions of a meta-episode.
+        ppo: PPO's numbers; the horizon is the number of actions in a meta-episode.
     """
 
     rollouts: Annotated[int, Ge(1)] = 16
@@ -82,9 +82,9 @@ class ProposerSettings:
 
 
 Workers = tuple[WorkerSettings, Callable[[str], Task]]
-"""Other processes in which replicas of the Solver are trained, and what makes the task there.
+"""Other processes in which replicas of the Solver train, and a function that makes the task there.
 
-Given its device; it can be pickled.
+The function takes a device, and can be pickled.
 """
 
 
@@ -92,13 +92,13 @@ class Components(NamedTuple):
     """The parts of a run that curricula are made of.
 
     Attributes:
-        task: what is to be learnt: a :class:`~proposer_rl.Task`, or in a
-            :class:`~proposer_rl.Teacher` perhaps a space of levels alone.
+        task: a :class:`~proposer_rl.Task`; in a :class:`~proposer_rl.Teacher` it may be only a
+            space of levels.
         proposer: the Proposer's settings.
         seed: of the Solver, and of a Proposer's weights.
-        on_update: called with the number of an episode's updates after every one of the replicas
-            that are trained in this process.
-        workers: where else they are trained; None for this process.
+        on_update: called after every update of replicas in this process, with the number of updates
+            in the episode so far.
+        workers: other processes for the replicas; None for this process.
     """
 
     task: Any
@@ -131,9 +131,9 @@ def meta_env(
         config: the Proposer's settings.
         streams: of the replicas' first weights.
         reward: of an update.
-        share: the numbers of the replicas that train here.
+        share: numbers of the replicas that train here.
         on_update: called after every update; see :class:`SolverTrainingEnv`.
-        kind: the environment's class.
+        kind: class of the environment.
     """
     return kind(
         task.learner([streams] * len(share)),

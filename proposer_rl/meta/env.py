@@ -32,9 +32,9 @@ class Learner(Protocol):
     learner; ``examples/own_learner.py`` shows another kind.
 
     Attributes:
-        env: with ``batch_size`` [K, P], ``device``, and ``set_levels(levels [K, P])``, which says
-            what the next update trains on.
-        agent: what the task's ``performance`` and ``probe`` take.
+        env: with ``batch_size`` [K, P], ``device``, and ``set_levels(levels [K, P])``, which sets
+            the levels of the next update.
+        agent: argument of the task's ``performance`` and ``probe``.
         copies: the number K.
         horizon: environment steps of an update on one level.
     """
@@ -55,7 +55,7 @@ class Learner(Protocol):
         """Raises a DivergedError if a number of the last update is not finite.
 
         Args:
-            first: number of the first learner, by which they are named.
+            first: number of the first learner, for naming learners.
         """
 
     def snapshot(self) -> TensorDict:
@@ -68,19 +68,18 @@ class Learner(Protocol):
 class SolverView:
     """Observes Solvers for a Proposer: performance and outputs on target levels.
 
-    The validation levels, on which performance is measured, and the probe levels, on which answers
+    The validation levels, on which performance is measured, and the probe levels, on which outputs
     are shown, are drawn anew for every cycle.
 
     Args:
-        task: gives the target distribution, and evaluates Solvers on its levels.
-        validation_levels: number E of levels that performance is measured on.
-        probe_levels: number C of levels whose answers are shown.
+        task: provides the target distribution, and evaluates Solvers on its levels.
+        validation_levels: number E of levels on which performance is measured.
+        probe_levels: number C of levels on which outputs are shown.
     """
 
     def __init__(self, task: Task, *, validation_levels: int, probe_levels: int) -> None:
         self.task = task
-        self.validation_levels = validation_levels
-        self.probe_levels = probe_levels
+        self.validation_levels, self.probe_levels = validation_levels, probe_levels
         self.draw_levels(Streams(0))
 
     def draw_levels(self, streams: Streams) -> None:
@@ -94,8 +93,8 @@ class SolverView:
     def performance(self, agent: ActorCritic, *place: int) -> TensorDictBase:
         """Measures K Solvers on the validation levels: a tensordict [K, E].
 
-        A task that evaluates by playing draws from a stream of its own for every ``place``, the
-        numbers that tell the evaluations of a cycle apart.
+        A task that evaluates by playing draws from a separate stream for every ``place``, numbers
+        that identify an evaluation within a cycle.
         """
         generator = self.streams.generator("evaluation", *place)
         return self.task.performance(agent, self.validation, generator)
@@ -113,12 +112,12 @@ class SolverView:
         Args:
             performance: on the validation levels, [K, E].
             probes: float [K, C, ...].
-            progress: the part of the meta-episode that is over, in [0, 1].
+            progress: the elapsed part of the meta-episode, in [0, 1].
 
         Returns:
-            A tensordict [K] of ``probes`` float [K, C, ...], and of numbers float [K, 1]: the
-            means over the validation levels of ``return`` and, where the task has a success, of
-            ``log_success``; ``progress``.
+            A tensordict [K] of ``probes`` float [K, C, ...], and of numbers float [K, 1]: the mean
+            ``return`` over the validation levels, ``log_success`` likewise if the task has a
+            success, and ``progress``.
         """
         numbers = {"return": mean_return(performance)}
         if "success" in performance.keys():
@@ -136,29 +135,30 @@ class SolverView:
 class SolverTrainingEnv(EnvBase):
     """Trains K Solvers as a batch of K episodes (the paper's section 5).
 
-    An action says which P levels the Solvers train on. A step generates those levels, updates each
-    Solver on its own ones, and observes it. An episode is ``meta_episode_length`` updates of
-    Solvers that all start as the one given to :meth:`fork`. Nothing here knows what a level is.
+    An action defines P levels for each Solver. A step generates the levels, updates each Solver on
+    its own ones, and observes it. An episode has ``meta_episode_length`` updates of Solvers that
+    all start as the one given to :meth:`fork`. The environment works with any kind of level.
 
     An action may be repeated for several updates, each on fresh levels. The episode then has fewer
-    steps, the Solvers are evaluated only between them, and the effect of an action is more easily
-    told from chance.
+    steps, the Solvers are evaluated only between them, and the effect of an action is easier to
+    distinguish from chance.
 
     Observations: those of :meth:`SolverView.observation`, and ``proposed`` int64 [K, N], how often
-    each bin was drawn in the step before. Actions: ``action``, as ``actions`` defines them.
-    Episodes end by ``terminated``.
+    each bin was drawn in the last step. Actions: ``action``, as ``actions`` defines them. Episodes
+    end by ``terminated``.
 
     Args:
         solvers: the K Solvers, which train side by side.
-        view: what is seen of the Solvers, and the validation levels that the gain is measured on.
-        actions: from actions to levels.
-        reward: from an update to a number for each Solver; a step's is the sum over its updates.
-        meta_episode_length: updates L of an episode.
-        action_repeat: updates for which an action holds; divides L.
-        first_replica: number of the first of these Solvers, where others are trained elsewhere: a
-            replica's random numbers belong to its number.
-        on_update: called after every update with the number of those that the episode has had,
-            e.g. by a progress bar; what it raises ends the episode.
+        view: observes the Solvers, and has the validation levels on which the gain is measured.
+        actions: turns actions into levels.
+        reward: returns a number for each Solver and update; a step's reward is the sum over its
+            updates.
+        meta_episode_length: number L of updates in an episode.
+        action_repeat: number of updates for which an action holds; divides L.
+        first_replica: number of the first of these Solvers if others train elsewhere; random
+            numbers belong to the number of a replica.
+        on_update: called after every update with the number of updates in the episode so far, e.g.
+            for a progress bar; an exception ends the episode.
 
     Raises:
         ValueError: if ``action_repeat`` does not divide L.
@@ -185,13 +185,9 @@ class SolverTrainingEnv(EnvBase):
         assert solvers.copies is not None  # a population
         self._replicas = range(first_replica, first_replica + solvers.copies)
         super().__init__(device=solvers.env.device, batch_size=[len(self._replicas)])
-        self.solvers = solvers
-        self.view = view
-        self.actions = actions
-        self.meta_episode_length = meta_episode_length
-        self.action_repeat = action_repeat
-        self._reward = reward
-        self.on_update = on_update or (lambda done: None)
+        self.solvers, self.view, self.actions = solvers, view, actions
+        self.meta_episode_length, self.action_repeat = meta_episode_length, action_repeat
+        self._reward, self.on_update = reward, on_update or (lambda done: None)
         self.fork(solvers.snapshot()[0], Streams(0))
         self._make_specs()
 
@@ -205,17 +201,12 @@ class SolverTrainingEnv(EnvBase):
         """The number P of levels in an update."""
         return int(self.solvers.env.batch_size[1:].numel())
 
-    @property
-    def frames_per_update(self) -> int:
-        """The number of environment steps in one Solver's update."""
-        return self.batch_of_levels * self.solvers.horizon
-
     def fork(self, solver: TensorDictBase, streams: Streams) -> None:
         """Starts the next episodes from one Solver, with new validation and probe levels.
 
         Args:
             solver: a snapshot of it, batch [] (weights and Adam's state).
-            streams: random streams of the levels and of the Solvers' actions.
+            streams: random streams for the levels and the Solvers' actions.
         """
         self.streams = streams
         self.view.draw_levels(streams)
@@ -226,7 +217,7 @@ class SolverTrainingEnv(EnvBase):
         self._origin_seen = self._performance(), self.view.probe(self.solvers.agent)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
-        # Only marks the start: a collector resets as soon as an episode has ended, and the trained
+        # Only marks the start: a collector resets as soon as an episode ends, and the trained
         # Solvers must stay readable until the next one really begins.
         self._updates = 0
         none_yet = torch.zeros(*self.batch_size, self.actions.bins, dtype=torch.int64)
@@ -256,7 +247,7 @@ class SolverTrainingEnv(EnvBase):
         levels, choices = self.actions.levels(action, self.batch_of_levels, streams)
         self.solvers.env.set_levels(levels)
         generators = [stream.generator("actions") for stream in streams]
-        # A collector steps its environment without gradients; this one learns inside.
+        # A collector steps its environment without gradients, but Solvers learn here.
         place = f"update {self._updates} of the episode of the Solver's copies"
         with torch.enable_grad(), located(place):
             update = self.solvers.update(generators)

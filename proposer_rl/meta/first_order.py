@@ -1,11 +1,12 @@
 """Estimates from gradients how training on a level would change a Solver.
 
-Training moves a Solver's parameters from theta to theta + d, and the performance R on the target by
+Training moves the parameters of a Solver from theta to theta + d, and the performance R on the
+target by
 
     R(theta + d) - R(theta)  =  <grad R(theta), d> + O(|d|^2).
 
-Adam's step is about d = rate * m / (sqrt(v) + eps), v its bias-corrected second moment and m the
-mean over the batch's problems p of the gradients g_p of their returns. So to first order the gain
+Adam's step is about d = rate * m / (sqrt(v) + eps), where v is its bias-corrected second moment and
+m the mean of the gradients g_p of the returns of the batch's problems p. So to first order the gain
 is the mean over problems of <u, g_p>, with
 
     u  =  grad R(theta) / (sqrt(v) + eps),
@@ -15,27 +16,24 @@ the problem's own return J_p along u,
 
     <u, g_p>  =  d/de J_p(theta + e u)  =  (J_p(theta + s u) - J_p(theta - s u)) / 2 s + O(s^2),
 
-two forward passes for any number of problems, also of such that nobody has trained on. Where J_p
-is not known exactly, the surrogate of episodes takes its place: with advantages A_t,
+which takes two forward passes for any number of problems, even problems that nobody trained on.
 
-    <u, g_p>  is estimated by  d/de sum over t of A_t log pi_(theta + e u)(a_t | s_t).
+Here u is scaled to a root mean square of 1 over the parameters of each Solver. So a step of ``s``
+moves a parameter by about s, like a step of Adam with this learning rate. With a million parameters
+that is a long way, along which returns are not linear: if s is the learning rate, the difference is
+a secant, the effect of a step towards the target; with a twentieth of it, it is the derivative
+(docs/explanation/first_order.md compares them).
 
-Here u is scaled to a root mean square of 1 over the parameters of each Solver: a step of ``s`` then
-moves a parameter by about s, as a step of Adam with that learning rate does. For a million
-parameters together that is a long way, on which returns are no straight lines: with s the learning
-rate the difference is a secant, what a step towards the target changes, and with a twentieth of it
-the derivative (docs/explanation/first_order.md compares them).
+Related work aligns gradients of training examples with those of a validation set: TracIn (Pruthi et
+al. 2020, arXiv 2002.08484) and example weights (Ren et al. 2018, arXiv 1803.09050); in curricula,
+SHED uses the mean gain over evaluation levels (arXiv 2310.00301).
 
-Relatives: gradients of training examples aligned with those of a validation set: TracIn (Pruthi et
-al. 2020, arXiv 2002.08484), example weights (Ren et al. 2018, arXiv 1803.09050); in curricula the
-mean gain over evaluation levels: SHED (arXiv 2310.00301).
-
-Without a target, :class:`LevelGradients` tells how much training on one level alone would change a
-Solver: |grad J_p(theta)|^2. It is zero where training would change nothing: on a level that the
+Without a target, :class:`LevelGradients` measures how much training on one level alone would change
+a Solver: |grad J_p(theta)|^2. It is zero if training would change nothing: on a level that the
 policy cannot fail, and on one that it cannot solve. PACE (arXiv 2605.01358) scores a level with
-|d|^2. Here it is the gradient of the return: no critic's loss is in it, no standardised advantages
-and no clipped norm, which hide how long it is, and it is not Adam's step, whose first one has a
-length of about rate * sqrt(number of parameters) whatever the gradient.
+|d|^2. Here it is the gradient of the return alone, without the loss of a critic, standardised
+advantages or a clipped norm, which would hide its length. Nor is it Adam's step, whose first one
+has a length of about rate * sqrt(number of parameters) for any gradient.
 """
 
 from __future__ import annotations
@@ -59,15 +57,15 @@ from proposer_rl.task import DifferentiableTask, Levels, Task
 SECOND_MOMENT_DECAY = 0.999  # torch.optim.Adam's beta_2
 
 Direction = Mapping[str, Tensor]
-"""A direction in which the parameters of K Solvers can be moved: by their names, [K, ...]."""
+"""A direction in which to move the parameters of K Solvers: by name, [K, ...]."""
 
 TargetMeasure = Literal["log_success", "return"]
 
 LEVELS_AT_ONCE = 16
-"""Levels of :class:`LevelGradients`: as many networks, gradients and activations are in memory."""
+"""Levels at once in :class:`LevelGradients`, each with a network, gradients and activations."""
 
 LevelValue = Callable[[ActorCritic, int, Tensor], Tensor]
-"""From m agents, a Solver's number k and places of m of its levels, int64 [m], to float [m]."""
+"""From m agents, a Solver's number k and m places of its levels, int64 [m], to float [m]."""
 
 
 def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
@@ -79,8 +77,7 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
             from the first update on, or ``"return"``.
 
     Raises:
-        DivergedError: if a Solver's success is exactly 0 on every level: then nothing points
-            towards more of it.
+        DivergedError: if a Solver's success is exactly 0 on every level, which has no gradient.
         NoSuccessError: if the task has no success.
     """
     if measure == "return":
@@ -89,7 +86,7 @@ def target_performance(performance: TensorDictBase, measure: str) -> Tensor:
     _require_none(
         (success <= 0).all(1),
         f"the probability of success is exactly 0 on each of {success.shape[1]} levels of the "
-        "target, so that nothing points towards it; measure=return may",
+        "target, so it has no gradient; try measure=return",
     )
     return mean
 
@@ -101,9 +98,9 @@ def target_direction(learner: PPO | Replica, performance: Tensor) -> dict[str, T
     first step there is no second moment, and nothing is divided.
 
     Args:
-        learner: whose agent the performance is of, and whose Adam says how steps are scaled.
-        performance: exact R of each Solver, float [K], with gradients towards the agent's
-            parameters; see :func:`target_performance`.
+        learner: provides the agent, and the state of Adam.
+        performance: exact R of each Solver, float [K], with gradients to the agent's parameters;
+            see :func:`target_performance`.
 
     Raises:
         DivergedError: if the gradient of a Solver is zero, or not finite.
@@ -169,15 +166,15 @@ def alignment(
 ) -> Tensor:
     """Computes the slope of what K Solvers gain along a direction, by a central difference.
 
-    Two forward passes suffice on any kind of network, also where neither forward-mode nor second
-    derivatives exist.
+    It takes two forward passes of any kind of network, even one without forward-mode or second
+    derivatives.
 
     Args:
         agent: the Solvers.
-        direction: as :func:`target_direction` makes it.
+        direction: from :func:`target_direction`.
         step: of the difference, such as the learning rate.
-        gained: returns what the agent gets as it stands, float [K, E], such as the exact return of
-            levels, or :func:`surrogate`.
+        gained: returns what the agent gains with its current parameters, float [K, E], such as the
+            exact return of levels.
 
     Returns:
         float [K, E].
@@ -232,11 +229,11 @@ def exact_alignment(
 def surrogate(agent: ActorCritic, rollout: TensorDictBase, advantage: Tensor) -> Tensor:
     """Averages A_t log pi(a_t | s_t) over the steps of each problem: float [K, P].
 
-    Its gradient is the policy gradient of each problem; the mean over problems is the batch's.
+    Its gradient is the policy gradient of each problem.
 
     Args:
         agent: the Solvers.
-        rollout: what they played, [K, P, T].
+        rollout: that they played, [K, P, T].
         advantage: of every step, float [K, P, T].
     """
     return over_steps(advantage * log_probabilities(agent, rollout), rollout)
@@ -245,8 +242,8 @@ def surrogate(agent: ActorCritic, rollout: TensorDictBase, advantage: Tensor) ->
 def over_steps(values: Tensor, rollout: TensorDictBase) -> Tensor:
     """Averages values [K, P, T] over the steps of each problem: float [K, P].
 
-    Episodes of several lengths are filled up to one length; ``is_step`` of the rollout, bool
-    [K, P, T], says which steps were played. Without it all were.
+    Episodes may be padded to one length; then ``is_step`` of the rollout, bool [K, P, T], says
+    which steps were played.
     """
     if "is_step" not in rollout.keys():
         return values.mean(-1)
@@ -280,12 +277,12 @@ def bin_scores(values: Tensor) -> tuple[Tensor, Tensor]:
 class LevelGradients:
     """Computes squared lengths of the gradients of single levels, many in one backward pass.
 
-    A population of :data:`LEVELS_AT_ONCE` networks gets the weights of the Solver whose levels are
-    scored, and each network a level of its own. So the sum of their values, differentiated once,
-    gives each the gradient of its level.
+    A population of :data:`LEVELS_AT_ONCE` networks gets the weights of the Solver, and each network
+    one of its levels. So one differentiation of the sum of their values gives each network the
+    gradient of its level.
 
     Args:
-        task: whose learners' levels are scored; the learners are left as they are.
+        task: makes the population; the learners do not change.
     """
 
     def __init__(self, task: Task) -> None:
@@ -314,8 +311,8 @@ class LevelGradients:
     ) -> Tensor:
         """Returns |grad|^2 of the :func:`surrogate` of levels, from episodes on them.
 
-        An estimate of a gradient is longer than the gradient by its noise: short rollouts score
-        higher than the exact gradient, by the estimate's variance.
+        Noise makes an estimated gradient longer: short rollouts score higher than the exact
+        gradient by the variance of the estimate.
 
         Args:
             learner: of K Solvers.
@@ -341,7 +338,7 @@ class LevelGradients:
         for solver in range(solvers):
             self._become(learner, solver)
             for start in range(0, count, LEVELS_AT_ONCE):
-                # Filled up with the last one.
+                # Padded with the last one.
                 which = torch.arange(
                     start, start + LEVELS_AT_ONCE, device=self._task.device
                 ).clamp_(max=count - 1)

@@ -64,27 +64,24 @@ ATTEMPTS = 3
 class ReplicasInWorkers(Replicas):
     """Trains the replicas in worker processes, each of which has a share of them.
 
-    Where a worker is lost, all are started anew and the episode is repeated, with the same numbers.
+    If a worker is lost, all are restarted and the episode is repeated, with the same numbers.
 
     Args:
         proposer: PPO whose environment is a :class:`~proposer_rl.meta.env.SolverTrainingEnv` of all
-            replicas; it is used for all but the replicas' training.
-        make_env: makes a worker's environment, given its ``share`` of the replicas, ``device`` and
+            replicas; it does everything except train the replicas.
+        make_env: makes a worker's environment from its ``share`` of the replicas, ``device`` and
             number of ``threads``, such as :func:`worker_env`; can be pickled.
         settings: how many workers there are, and where.
     """
 
     def __init__(
-        self,
-        proposer: PPO,
-        make_env: Callable[..., SolverTrainingEnv],
-        settings: WorkerSettings,
+        self, proposer: PPO, make_env: Callable[..., SolverTrainingEnv], settings: WorkerSettings
     ) -> None:
         super().__init__(proposer)
         self._make_env = make_env
         self._settings = settings
         self._shares = shares(self._env.batch_size[0], settings.workers)
-        # Of each replica its place, [K], among those of all workers: in the first that has it.
+        # The place of each replica, [K], among those of all workers: in the first that has it.
         every = [replica for share in self._shares for replica in share]
         self._first = [every.index(replica) for replica in range(self._env.batch_size[0])]
         self._collector: BaseCollector | None = None
@@ -95,7 +92,7 @@ class ReplicasInWorkers(Replicas):
 
         Raises:
             DivergedError: if a replica diverges, as in one process.
-            WorkersError: if workers are lost again and again.
+            WorkersError: if workers are lost several times.
         """
         self._env.view.draw_levels(streams)
         for attempt in range(1, ATTEMPTS + 1):
@@ -107,14 +104,14 @@ class ReplicasInWorkers(Replicas):
             except lost(self._settings) as error:
                 self._losses += 1
                 self.close()
-                # A worker's error comes with its traceback before.
+                # The traceback of a worker precedes its error.
                 reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
                 if attempt == ATTEMPTS:
                     raise WorkersError(
                         f"workers={len(self._shares)}: were lost {ATTEMPTS} times in one cycle, "
-                        f"last: {reason}; the same command goes on from the last checkpoint"
+                        f"last: {reason}; the same command resumes from the last checkpoint"
                     ) from error
-                # It may have been the signal that ends this run, too.
+                # The loss may be due to a signal that ends this run, too.
                 self._env.on_update(0)
                 warnings.warn(
                     f"a worker was lost ({reason}); it is replaced and the episode repeated",
@@ -173,11 +170,11 @@ class ReplicasInWorkers(Replicas):
 class WorkerEnv(SolverTrainingEnv):
     """The meta-environment in a worker: reports a Solver that diverges instead of raising.
 
-    An exception would end the collector's process, and the worker would be replaced in vain.
+    An exception would end the collector's process, and replacing the worker would not help.
 
     Attributes:
-        diverged: the line that says what has not been finite since the last fork, and where; None
-            where all is well.
+        diverged: the message of what was not finite since the last fork, and where; None if all is
+            well.
     """
 
     diverged: str | None = None
@@ -193,7 +190,7 @@ class WorkerEnv(SolverTrainingEnv):
                 return super()._step(tensordict)
             except DivergedError as error:
                 self.diverged = str(error)
-        # What is left of the rollout is of no use to anyone.
+        # The rest of the rollout is not used.
         state = self._reset()
         self._updates = self.meta_episode_length
         ended = torch.ones_like(state["terminated"])
@@ -256,8 +253,8 @@ class WorkerPolicy(RolloutPolicy):
 def shares(replicas: int, workers: int) -> list[range]:
     """Splits K replicas into ranges of equal length, one for each worker.
 
-    Where K is no multiple of the workers, the last ranges overlap: what one process has to do
-    takes no longer for it, and TorchRL's collectors want batches of one shape.
+    If K is not a multiple of the workers, the last ranges overlap, because TorchRL's collectors
+    need batches of one shape. This takes no longer.
     """
     each = -(-replicas // workers)
     starts = [min(worker * each, replicas - each) for worker in range(workers)]

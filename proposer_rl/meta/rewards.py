@@ -13,19 +13,19 @@ from proposer_rl.models import ActorCritic
 from proposer_rl.task import NoSuccessError
 
 LEAST_SUCCESS = 1e-3
-"""A success rate that is small beside this hardly counts in :func:`log_success`."""
+"""Success rates far below this hardly matter in :func:`log_success`."""
 
 
 class TrainingStep(NamedTuple):
     """One PPO update of K Solvers, from which the Proposer's reward is computed.
 
     Attributes:
-        levels: what they trained on, batch [K, P].
+        levels: that they trained on, batch [K, P].
         rollout: the transitions that they collected there before the update, [K, P, T].
         agent: the Solvers after the update.
         before, after: their performance on the validation levels, tensordicts [K, E] with
-            ``return`` and, where it has a meaning, ``success``. Within an action that is repeated
-            both are those before it, but for its last update.
+            ``return`` and, if the task has one, ``success``. While an action is repeated, both are
+            from before the action, except in its last update.
     """
 
     levels: Any
@@ -59,9 +59,9 @@ def performance_gain(step: TrainingStep) -> Tensor:
 def log_success_gain(step: TrainingStep) -> Tensor:
     """Returns the gain in mean log(success + 0.001) on the validation levels.
 
-    This is the default. A beginner's return on the target hardly moves, whatever it trains on: from
-    one success in five hundred to one in a hundred is a step of 0.008. The logarithm of its success
-    moves by 1.6, and shows what was due to the training.
+    This is the default. The return of a beginner on the target hardly moves: from one success in
+    five hundred to one in a hundred is a step of 0.008. The logarithm of its success moves by 1.6,
+    which shows the effect of the training.
     """
     return mean_log_success(step.after) - mean_log_success(step.before)
 
@@ -69,9 +69,9 @@ def log_success_gain(step: TrainingStep) -> Tensor:
 def task_difficulty(step: TrainingStep) -> Tensor:
     """Returns one minus the success rate on the proposed levels (the paper's ablation).
 
-    It is the success rate of the Solver's own training episodes, the first on every level. Where
-    episodes go on from update to update, the first to end may have begun on a level of the update
-    before.
+    The success rate is that of the Solver's own training episodes, the first on every level. If
+    episodes go on from update to update, the first to end may have begun on a level of an earlier
+    update.
     """
     return 1.0 - first_episode_success(step.rollout).float().mean(1)
 

@@ -16,13 +16,13 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torchrl.collectors import BaseCollector, MultiSyncCollector
 
-# What a collector raises when a process of its own has died or cannot be reached any more.
+# Exceptions of a collector whose process has died or cannot be reached any more.
 LOST = (RuntimeError, EOFError, OSError, ValueError)
 SECONDS_TO_CLOSE = 5.0
 SECONDS_TO_ANSWER = 60.0  # of a cluster
-SECONDS_TO_START = 300.0  # of workers, which others may keep from a cluster's processors
-SECONDS_TO_SAY = 20.0  # between two lines on what is waited for
-SECONDS_TO_POLL = 0.5  # between two looks at whoever is waited for
+SECONDS_TO_START = 300.0  # of workers, while others may use a cluster's processors
+SECONDS_TO_SAY = 20.0  # between two warnings while waiting
+SECONDS_TO_POLL = 0.5  # between two checks while waiting
 
 
 class WorkersError(RuntimeError):
@@ -38,9 +38,9 @@ class WorkerSettings(NamedTuple):
         engine: ``"multiprocess"``: processes of this machine, by TorchRL's
             :class:`~torchrl.collectors.MultiSyncCollector`; ``"ray"``: actors of a Ray cluster, by
             its :class:`~torchrl.collectors.distributed.RayCollector`.
-        workers: their number.
-        devices: torch's names, one for each worker in turn.
-        cores: how many of a processor each worker may use.
+        workers: number of workers.
+        devices: names of torch devices, assigned to the workers in turn.
+        cores: number of processor cores for each worker.
         ray_address: of a running cluster; None to start one on this machine.
     """
 
@@ -63,11 +63,11 @@ def start(
 
     Args:
         settings: how many workers there are, and where.
-        environments: their factories, one for each worker; they can be pickled.
-        policies: likewise.
-        frames: how many of them a worker collects in a batch.
-        check: called again and again while workers are waited for; may raise.
-        patient: whether to wait for machines that are missing, as after one was lost.
+        environments: factories of environments, one for each worker; can be pickled.
+        policies: factories of policies, likewise.
+        frames: number of frames that a worker collects in a batch.
+        check: called repeatedly while waiting for workers; may raise.
+        patient: whether to wait for missing machines, as after a loss.
 
     Raises:
         WorkersError: if there is no such cluster, it is too small, or its workers do not come up.
@@ -86,7 +86,7 @@ def start(
             return MultiSyncCollector(
                 environments,
                 cat_results="stack",
-                # TorchRL would leave this process fewer threads; its sums would round otherwise.
+                # TorchRL would leave this process fewer threads, which would change rounding.
                 num_threads=threads,
                 num_sub_threads=threads,
                 **unused,
@@ -99,7 +99,7 @@ def start(
             environments,
             total_frames=sys.maxsize,  # -1, its default, ends a synchronous collection at once
             sync=True,
-            # One for each: TorchRL writes a worker's policy factory into them.
+            # A copy for each: TorchRL writes a worker's policy factory into them.
             collector_kwargs=[unused.copy() for _ in environments],
             remote_configs=[share.copy() for _ in environments],
             # The weights travel with every order. TorchRL's scheme joins all in one torch process
@@ -141,7 +141,7 @@ def stop(collector: BaseCollector) -> None:
 def quiet() -> Iterator[None]:
     """Restores the number of threads, which TorchRL's collectors change, and hides two warnings.
 
-    Both say that a worker's policy gets no weights: they come with every order.
+    Both say that a worker's policy gets no weights, which here come with every order.
     """
     threads = torch.get_num_threads()
     try:
@@ -168,8 +168,8 @@ def _cluster_share(
     if address is not None:
         cluster["address"] = address
     else:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # our own cluster reports to nobody
-        # As many as are asked for, or Ray would wait for processors that will never be there.
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage reports
+        # As many as the workers need, or Ray would wait for processors that do not exist.
         processors = max(os.cpu_count() or 1, cores * workers)
         cluster |= {"address": "local", "num_cpus": processors, "include_dashboard": False}
     try:
@@ -186,7 +186,7 @@ def _cluster_share(
     except BaseException:
         ray.shutdown()
         raise
-    return {**share, "scheduling_strategy": "SPREAD"}  # on several machines where it can be
+    return {**share, "scheduling_strategy": "SPREAD"}  # on several machines if possible
 
 
 def _short_of(share: dict[str, Any], workers: int) -> str | None:
@@ -219,7 +219,7 @@ def _wait_for_all(collector: Any, settings: WorkerSettings, check: Callable[[], 
 
     def missing() -> str | None:
         ready, waiting = ray.wait(begun, num_returns=workers, timeout=SECONDS_TO_POLL)
-        ray.get(ready)  # raises what has kept a worker from beginning
+        ray.get(ready)  # raises the error of a worker that failed to start
         free = ray.available_resources().get("CPU", 0)
         if not waiting:
             return None
@@ -234,7 +234,7 @@ def _wait(
     """Waits until a function returns no reason to wait, and warns of the reason now and then.
 
     Raises:
-        WorkersError: with the reason, where there still is one after ``limit`` seconds.
+        WorkersError: with the reason, if there still is one after ``limit`` seconds.
     """
     began = said = time.monotonic()
     while (why := reason()) is not None:
@@ -251,9 +251,9 @@ def _wait(
 def _connect(cluster: dict[str, Any], check: Callable[[], None]) -> None:
     """Connects to a Ray cluster in a thread that lives as long as the connection.
 
-    Ray puts handlers of its own in the place of those that save before the process ends, but only
-    in the main thread; and it goes on asking for a cluster for minutes. Linux ends the processes of
-    a cluster of one's own with the thread that has started them, as Ray asks it to.
+    In the main thread Ray would replace the signal handlers that save before the process ends, and
+    would block for minutes while it looks for a cluster. At Ray's request, Linux ends the processes
+    of a local cluster with the thread that started them, so this thread must stay alive.
 
     Raises:
         TimeoutError: if Ray does not answer in time.

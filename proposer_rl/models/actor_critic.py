@@ -27,25 +27,25 @@ from torchrl.envs import TensorDictPrimer
 class ActorCritic(TensorDictModuleBase):
     """Writes action logits and a state value; its ``encoder`` depends on the level alone.
 
-    Called as a module it is an ordinary TorchRL actor-critic: a tensordict with one observation per
-    step goes in, logits and value come out. Where the encoder's inputs stay the same throughout a
-    rollout, :meth:`encode` runs it once and :meth:`decode` reads the steps off that context, with
-    the same numbers and T times less arithmetic.
+    Called as a module it is an ordinary TorchRL actor-critic: it reads one observation per step,
+    and writes ``logits`` and ``state_value``. If the inputs of the encoder are the same throughout
+    a rollout, :meth:`encode` runs the encoder once and :meth:`decode` computes all steps from that
+    context, with the same numbers and T times less arithmetic.
 
     Args:
-        head: reads the encoder's outputs and the observation of a step, writes ``logits`` and
-            ``state_value``. With an encoder, every other input may carry time dimensions behind the
-            batch ones, [*B, *T, ...], and the outputs then carry them too.
-        encoder: reads what is constant within a level; None where nothing is.
+        head: reads the encoder's outputs and the observation of a step, and writes ``logits`` and
+            ``state_value``. With an encoder, every other input may have time dimensions after the
+            batch dimensions, [*B, *T, ...], and then the outputs have them too.
+        encoder: reads what is constant within a level; None if nothing is.
         distribution_class: builds the action's distribution from ``logits=``.
-        copies: K if parameters and data carry independent replicas as their first dimension
+        copies: K if parameters and data have independent replicas as their first dimension
             (:class:`~proposer_rl.models.Population`), None for a single network.
-        memory: of a head that state, the widths of its memory by the entries' names: it reads
-            them, zeros at first, writes them below ``next``, and goes through time where TorchRL's
-            ``recurrent_mode()`` says so (:func:`~proposer_rl.models.memory_actor_critic`).
+        memory: widths of the head's memory by entry name. The head reads these entries, zeros at
+            first, writes them below ``next``, and goes through time if TorchRL's
+            ``recurrent_mode()`` is on (:func:`~proposer_rl.models.memory_actor_critic`).
 
     Attributes:
-        normalization: between what is observed and the head, and of its values; None for none.
+        normalization: of observations and values; None for none.
     """
 
     def __init__(
@@ -58,10 +58,8 @@ class ActorCritic(TensorDictModuleBase):
         memory: Mapping[str, int] | None = None,
     ) -> None:
         super().__init__()
-        self.head = head
-        self.encoder = encoder
-        self.distribution_class = distribution_class
-        self.copies = copies
+        self.head, self.encoder = head, encoder
+        self.distribution_class, self.copies = distribution_class, copies
         self.level_keys = list(encoder.in_keys) if encoder is not None else []
         self.context_keys = list(encoder.out_keys) if encoder is not None else []
         self.step_keys = [key for key in head.in_keys if key not in self.context_keys]
@@ -91,7 +89,7 @@ class ActorCritic(TensorDictModuleBase):
         """
         inputs = tensordict.select(*self.step_keys)
         if self.encoder is not None:
-            # The time dimensions become features, so that context and steps share their batch.
+            # Time dimensions become features, so that context and steps have the same batch.
             inputs.batch_size = context.batch_size
             inputs.update(context)
         outputs = self._headed(inputs)
@@ -108,7 +106,7 @@ class ActorCritic(TensorDictModuleBase):
 
     def no_memory(self, tensordict: TensorDictBase) -> TensorDict:
         """Returns the memory before the first step of a batch [*B]: zeros."""
-        # TorchRL's collector hands on tensordicts without a device.
+        # TorchRL's collector passes on tensordicts without a device.
         batch, device = tensordict.batch_size, next(self.parameters()).device
         zeros = {key: torch.zeros(*batch, n, device=device) for key, n in self.memory.items()}
         return TensorDict(zeros, batch, device=device)
@@ -133,23 +131,24 @@ class ActorCritic(TensorDictModuleBase):
     def actor(self, *, sample: bool = False) -> ProbabilisticTensorDictSequential:
         """Returns this actor-critic as a TorchRL policy, for collectors and losses elsewhere.
 
-        An environment around which an agent with memory acts needs its :meth:`primer`. The critic
-        of a loss is the agent itself. TorchRL's ``GAE`` takes ``value_network=None``: the values of
-        this policy stand in a rollout, and ``agent(rollout["next"])`` writes those after each step.
-        As its network an agent would run under ``vmap``, or remember one episode in the next.
+        If the agent has memory, the environment needs its :meth:`primer`. Pass the agent itself as
+        the critic of a loss. Give TorchRL's ``GAE`` ``value_network=None``: this policy writes the
+        values into a rollout, and ``agent(rollout["next"])`` writes those after each step. As the
+        network of ``GAE`` an agent would run under ``vmap``, or carry memory from one episode to
+        the next.
 
         Args:
-            sample: whether actions are drawn where nothing else is said, as in ``env.rollout``;
-                otherwise they are the most probable ones there, which explore nothing. TorchRL's
-                collectors and ``set_exploration_type`` say for themselves which it is to be.
+            sample: whether to draw actions by default, as in ``env.rollout``, instead of taking the
+                most probable ones, which do not explore. TorchRL's collectors and
+                ``set_exploration_type`` override the default.
         """
         return ProbabilisticTensorDictSequential(self, self.sampler(sample=sample))
 
     def primer(self) -> TensorDictPrimer:
         """Returns TorchRL's transform that gives an environment the memory of this agent.
 
-        ``TransformedEnv(env, agent.primer())`` hands the memory on from step to step, for rollouts
-        and collectors of other code; an agent without memory needs none.
+        ``TransformedEnv(env, agent.primer())`` carries the memory from step to step, for rollouts
+        and collectors elsewhere. An agent without memory needs no primer.
         """
         device = next(self.parameters()).device
         specs = {key: data.Unbounded((width,), device=device) for key, width in self.memory.items()}
@@ -158,7 +157,7 @@ class ActorCritic(TensorDictModuleBase):
     def readout(self) -> tuple[ProbabilisticTensorDictSequential, TensorDictModule]:
         """Returns actor and critic that read logits and values from a tensordict.
 
-        For a TorchRL loss whose caller has run this module already, so that actor and critic share
+        For a TorchRL loss whose caller has already run this module, so that actor and critic share
         one forward pass.
         """
         logits = TensorDictModule(nn.Identity(), ["logits"], ["logits"])
@@ -206,8 +205,8 @@ def distribution_of(acts: data.TensorSpec) -> Callable[..., Distribution]:
 def draw_at(distribution: Distribution, uniform: Tensor) -> Tensor:
     """Samples by inverting the cumulative distribution function at ``uniform``.
 
-    Torch's distributions take no generator. This way the random numbers are data, which can be
-    drawn for a whole rollout at once and from one generator per replica.
+    Torch's distributions take no generator. Here random numbers are data, which can be drawn for a
+    whole rollout at once and from one generator per replica.
 
     Args:
         distribution: categorical, or any other with ``icdf``; possibly ``Independent``.
@@ -220,8 +219,8 @@ def draw_at(distribution: Distribution, uniform: Tensor) -> Tensor:
         threshold = uniform.unsqueeze(-1) * cumulative[..., -1:]
         index = (cumulative <= threshold).sum(-1)
         return index.clamp_(max=cumulative.shape[-1] - 1)
-    # Zero is among the uniform numbers, but its quantile may be infinite: the middle of the
-    # interval that it stands for is taken instead.
+    # Uniform numbers include zero, whose quantile may be infinite: take the middle of the interval
+    # that zero stands for.
     return distribution.icdf(uniform.clamp(min=torch.finfo(uniform.dtype).eps / 4))
 
 
@@ -230,8 +229,8 @@ def uniform_noise(
 ) -> Tensor:
     """Draws uniform numbers ``[T, *shape]`` for T steps; [:, k] comes from the k-th generator.
 
-    They are drawn on the CPU, so that they are the same for every device, and handed on without
-    waiting for it. Without generators all of it comes from torch's default one.
+    They are drawn on the CPU, so that they are the same for every device, and copied without
+    waiting for it. Without generators, torch's default one is used.
     """
     if generators is None:
         drawn = torch.rand(steps, *shape)
@@ -253,7 +252,7 @@ def orthogonal_(module: nn.Module, gain: float = 2**0.5) -> None:
 
 
 FARTHEST = 10.0
-"""Standard deviations from the mean at which a normalised number ends, as is usual."""
+"""Standard deviations from the mean at which normalised numbers are clipped, as is usual."""
 
 TINY = 1e-8  # added to variances
 
@@ -261,12 +260,12 @@ TINY = 1e-8  # added to variances
 class RunningMoments(nn.Module):
     """Keeps mean and variance of all numbers so far, separately for each replica.
 
-    TorchRL's ``VecNormV2`` has one set for a whole batch of environments or one for each of them,
-    and none for each row; and what a transform of an environment knows, an agent that is evaluated
-    elsewhere does not. So they belong to the agent here, and stand still but where it trains.
+    TorchRL's ``VecNormV2`` keeps moments for a whole batch of environments or for each of them, but
+    not for each replica; and an agent that is evaluated elsewhere does not have the moments of an
+    environment's transform. So the moments belong to the agent here, and change only in training.
 
-    Merged by Chan et al. 1983 ("Algorithms for computing the sample variance"), in float64, of
-    whatever has the shape S.
+    Numbers have the shape S. Moments are merged in float64 as in Chan et al. 1983 ("Algorithms for
+    computing the sample variance").
     """
 
     count: Tensor
@@ -291,7 +290,7 @@ class RunningMoments(nn.Module):
         before = self.count.reshape(*self.count.shape, *[1] * len(shape))
         share = new / (before + new)
         apart = mean - self.mean
-        # At first there is no variance, whatever stands there.
+        # At first the share is 1, so the initial variance does not matter.
         self.variance.copy_(
             (1 - share) * self.variance + share * variance + share * (1 - share) * apart.square()
         )
@@ -318,11 +317,11 @@ class RunningMoments(nn.Module):
 class Normalization(nn.Module):
     """Standardises an agent's observations, and keeps the unit of its values.
 
-    Rewards stay what they are. Instead the critic's outputs are multiplied with the standard
-    deviation of the discounted return, and its loss is taken in that unit: the same as rewards
-    divided by it, while values can be read without knowing of the unit.
+    Rewards do not change. Instead, the outputs of the critic are multiplied by the standard
+    deviation of the discounted return, and its loss is taken in that unit. This equals dividing the
+    rewards by it, but values can be read without knowing the unit.
 
-    ``observations`` are the shapes of the entries that are normalised, by name.
+    ``observations`` are the shapes of the normalised entries, by name.
     """
 
     def __init__(

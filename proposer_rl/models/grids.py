@@ -14,8 +14,8 @@ from torch.nn import functional as F
 from proposer_rl.models.actor_critic import ActorCritic, categorical, orthogonal_
 from proposer_rl.models.population import Conv3x3, Population
 
-LARGEST_MATRIX = 2**22  # numbers in the weights of an interpolation: a 64x64 grid from its half
-CELLS_PER_PASS = 2**17  # that go through a network together, where each has planes of its own
+LARGEST_MATRIX = 2**22  # weights of an interpolation, such as to a 64x64 grid from its half
+CELLS_PER_PASS = 2**17  # cells that go through a network together, if each has its own planes
 
 
 class DoubleConv(nn.Sequential):
@@ -96,9 +96,9 @@ class UNet(nn.Module):
 def upsample(maps: Tensor, size: Sequence[int]) -> Tensor:
     """Interpolates maps [B, C, h, w] bilinearly to [B, C, H, W], as ``F.interpolate`` does.
 
-    One product with a constant matrix: on small maps its backward pass takes a fraction of the time
-    of the kernel's, and the result stays in the channels-last layout. Maps for which the matrix
-    would be large are left to the kernel.
+    This is one product with a constant matrix: on small maps its backward pass takes a fraction of
+    the kernel's time, and the result stays in the channels-last layout. If the matrix were large,
+    the kernel is used instead.
     """
     height, width = size
     if height * width * maps.shape[-2:].numel() > LARGEST_MATRIX:
@@ -128,7 +128,7 @@ def map_actor_critic(network: nn.Module, *, per_step: bool = False) -> ActorCrit
         network: returns logits [*B, A, H, W] and values [*B, 1, H, W]; a
             :class:`~proposer_rl.models.Population` of such networks takes B = [K, ...].
         per_step: True if the planes change from step to step (the agent is drawn on one of them);
-            False if they belong to the level, which then costs one forward pass per rollout.
+            False if they belong to the level, so that a rollout costs one forward pass.
 
     Example:
         >>> from proposer_rl import UNet

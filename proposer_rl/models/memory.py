@@ -25,21 +25,21 @@ sigmoid_slope_ = torch.ops.aten.sigmoid_backward.grad_input
 tanh_slope_ = torch.ops.aten.tanh_backward.grad_input
 
 MEMORY = ("recurrent_state_h", "recurrent_state_c")
-"""Entries of the memory, by the names that TorchRL's LSTM has for them."""
+"""Entries of the memory, named as TorchRL's LSTM names them."""
 
 
 class MemoryNetwork(nn.Module):
     """Encodes observations, remembers them by an LSTM, and has a hidden layer for each head.
 
-    TorchRL's ``LSTMModule`` splits sequences where episodes begin and pads the pieces; on a batch
-    whose episodes have different lengths that is many times the work. Here all of them go on side
-    by side, and the memory of those that begin is set to zero.
+    TorchRL's ``LSTMModule`` splits sequences where episodes begin and pads the pieces, which is
+    many times the work if episodes have different lengths. Here all sequences run side by side, and
+    the memory is set to zero where an episode begins.
 
     Args:
-        encoder: maps observations [N, ...] to features [N, F]. If it has ``codes``, which maps them
-            to numbers int64 [N] that are equal only where they are, those that are seen more than
-            once are encoded once.
-        features: number F of them.
+        encoder: maps observations [N, ...] to features [N, F]. If it has a method ``codes``, which
+            maps observations to numbers int64 [N] that only equal observations share, repeated
+            observations are encoded once.
+        features: number F of features.
         actions: number A of actions.
         memory: width M of the LSTM.
         head: width of the heads' hidden layers.
@@ -68,10 +68,10 @@ class MemoryNetwork(nn.Module):
         """Reads N sequences of T steps.
 
         Args:
-            begins: bool [N, T, 1], whether an episode begins with the step.
+            begins: whether an episode begins with the step, bool [N, T, 1].
             hidden: of the memory before the first step, float [N, M].
-            cell: the same.
-            *observed: what the encoder takes, [N, T, ...] each.
+            cell: likewise, float [N, M].
+            *observed: inputs of the encoder, [N, T, ...] each.
 
         Returns:
             Logits [N, T, A], values [N, T, 1], and the memory after every step, [N, T, M] twice.
@@ -104,15 +104,15 @@ def memory_actor_critic(
 ) -> ActorCritic:
     """Makes an actor-critic of K networks with memory.
 
-    As with TorchRL's recurrent modules, ``torchrl.modules.set_recurrent_mode(True)`` says that the
-    last batch dimension is time: the memory then goes through it from what stands at the first
-    step. Otherwise every element is a step of its own with the memory that stands there. Both write
-    the memory after each step below ``next``. ``is_init``, bool [*B, 1], says where episodes begin.
+    As with TorchRL's recurrent modules, ``torchrl.modules.set_recurrent_mode(True)`` makes the last
+    batch dimension time: the memory then runs through it, from its entries at the first step.
+    Otherwise every element is a single step with its own memory entries. Both write the memory
+    after each step below ``next``. ``is_init``, bool [*B, 1], marks where episodes begin.
 
     Args:
         population: of K networks such as :class:`MemoryNetwork`.
-        observed: entries that the networks' encoder takes, in order.
-        memory: width M of their memory.
+        observed: names of the entries that the encoder takes, in order.
+        memory: width M of the memory.
         distribution_class: builds the action's distribution from ``logits=``.
     """
     head = _MemoryHead(population, observed)
@@ -155,9 +155,9 @@ def through_time(
     Args:
         cell: has the weights of a ``torch.nn.LSTMCell``, of width M.
         inputs: [R, F].
-        rows: which of the inputs a step has, int64 [T, N].
+        rows: the row of the inputs for each step, int64 [T, N].
         begins: whether an episode begins with the step, bool [T, N, 1].
-        memory: before the first step, hidden and cell, [N, M] each.
+        memory: hidden and cell before the first step, [N, M] each.
 
     Returns:
         Hidden and cell after every step, [T, N, M] each.
@@ -175,8 +175,8 @@ def distinct(codes: Tensor) -> tuple[Tensor, Tensor]:
         codes: int64 [R].
 
     Returns:
-        One row of each kind, int64 [U], and the kind of each row, int64 [R]. On a GPU, which would
-        have to be waited for, and under ``vmap`` every row is a kind of its own.
+        One row of each kind, int64 [U], and the kind of each row, int64 [R]. Every row is its own
+        kind on a GPU, where comparing would wait for the device, and under ``vmap``.
     """
     return _Distinct.apply(codes)
 
@@ -256,7 +256,7 @@ def _backwards(
 
 def _compiled(steps: Any, on: Tensor) -> Any:
     """Returns the loop over steps as TorchScript on CPUs, which has less overhead."""
-    # Python 3.14 has no TorchScript; on a GPU the steps are recorded.
+    # Python 3.14 has no TorchScript; on a GPU the steps are recorded as a graph.
     if not population.at_hand(on) or sys.version_info >= (3, 14):
         return steps
     with _scripting:
@@ -269,7 +269,7 @@ _scripting = threading.Lock()  # replicas train in threads
 @cache
 def _scripted(steps: Any) -> Any:
     with warnings.catch_warnings():
-        # What is recommended in its place unrolls all steps before it compiles them.
+        # The recommended replacement would unroll all steps before compiling.
         warnings.filterwarnings("ignore", message=".*torch.jit.script")
         return torch.jit.script(steps)
 

@@ -29,20 +29,20 @@ MANY_CHANNELS = 64  # at least, in and out
 class Population(nn.Module):
     """Calls and trains K independent replicas of a network as one module.
 
-    Inputs and outputs carry the replicas as their first dimension, [K, ...], and replica ``k`` sees
-    only slice ``k``. The sum over replicas of each one's loss therefore gives every replica exactly
-    the gradient that it would have alone.
+    Inputs and outputs have the replicas as their first dimension, [K, ...], and replica ``k`` sees
+    only slice ``k``. So the sum of the losses of all replicas gives each one exactly the gradient
+    that it would have alone.
 
     Args:
         make: builds one network, without buffers, that maps tensors to one tensor or a tuple of
             them; called once per replica, in order.
-        copies: number of replicas K.
+        copies: number K of replicas.
         precision: ``"fp32"``, or ``"bf16"`` for autocast of the networks' arithmetic (parameters,
             gradients and outputs stay float32).
-        cores: replicas that are computed at once on a CPU, each by one thread; None for as many as
-            the process may use. The numbers are those of one thread whatever the cores.
-        batched: whether all replicas are computed at once, in each operation; None for doing so on
-            a GPU but not on a CPU, where only very small networks are faster that way.
+        cores: number of replicas that a CPU computes at once, each by one thread; None for all
+            processors of the process. The numbers do not depend on it.
+        batched: whether each operation computes all replicas at once; None for yes on a GPU and no
+            on a CPU, where only very small networks are faster that way.
 
     Raises:
         ValueError: for a network with buffers.
@@ -66,11 +66,9 @@ class Population(nn.Module):
         members = [make() for _ in range(copies)]
         if next(members[0].buffers(), None) is not None:
             raise ValueError("a Population's network must not have buffers")
-        self.copies = copies
-        self.precision = precision
-        self.cores = cores
-        self.batched = batched
-        # Of each parameter every place: layers may share it.
+        self.copies, self.precision = copies, precision
+        self.cores, self.batched = cores, batched
+        # All names of each parameter, because layers may share it.
         places: dict[nn.Parameter, list[str]] = {}
         for prefix, module in members[0].named_modules():
             for name, parameter in module.named_parameters(prefix, False, False):
@@ -81,7 +79,7 @@ class Population(nn.Module):
             nn.Parameter(torch.stack([p.detach() for p in parameters]), parameters[0].requires_grad)
             for parameters in zip(*(member.parameters() for member in members), strict=True)
         )
-        # In a tuple, so that nn.Module does not register it: it lends its structure, no numbers.
+        # In a tuple, so that nn.Module does not register it: only its structure is used.
         self._template = (members[0].to("meta"),)
 
     def prefer_products(self) -> None:
@@ -123,8 +121,8 @@ class Population(nn.Module):
 class StackedLinear(nn.Linear):
     """A linear layer whose parameters may be stacked, [K, ...], for inputs [K, *B, features].
 
-    Networks of nothing but such layers say so by a true ``stackable``: all replicas are then
-    computed without ``vmap``, which costs as much as the arithmetic of a small network.
+    A network made only of such layers sets ``stackable = True``. Its replicas are then computed
+    without ``vmap``, which costs as much as the arithmetic of a small network.
     """
 
     def forward(self, inputs: Tensor) -> Tensor:
@@ -139,14 +137,14 @@ class StackedLinear(nn.Linear):
 class Conv3x3(nn.Conv2d):
     """A 3x3 convolution with a border of zeros; the resolution stays.
 
-    In bf16 on a CPU the library's weight gradient takes several times as long as its forward pass
-    on maps of a few pixels with many channels. There it is computed as one matrix product instead;
-    everything else, and every other case, is PyTorch's.
+    In bf16 on a CPU, on small maps with many channels, PyTorch's weight gradient takes several
+    times as long as its forward pass. There it is computed as one matrix product; all else is
+    PyTorch's.
 
     Attributes:
-        as_product: whether all of it is one product with every pixel's neighbourhood. The
-            convolutions of stacked networks, which have a kernel for each of them otherwise, are
-            products of stacks then.
+        as_product: whether the whole convolution is one product with every pixel's neighbourhood.
+            The convolutions of stacked networks are then products of stacks, instead of one kernel
+            for each network.
     """
 
     as_product = False
@@ -287,7 +285,7 @@ class TorchDefaultsError(ValueError):
 def check_torch_defaults() -> None:
     """Refuses a default dtype other than float32, and a default device other than the CPU.
 
-    Random draws and networks would be others without a word.
+    With either of them, random draws and networks would silently differ.
 
     Raises:
         TorchDefaultsError: naming torch's own setting, and how to put it back.
@@ -306,12 +304,12 @@ def check_torch_defaults() -> None:
 def use_device(device: torch.device) -> None:
     """Makes a GPU the current device, with TF32 products and reproducible sums.
 
-    What it computes is the same every time: sums are not taken in the order in which threads come
-    to be done. Without a GPU nothing is changed.
+    Sums do not depend on the order in which threads finish, so results are the same every time.
+    Without a GPU nothing changes.
     """
     if device.type == "cuda":
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
-        # It warns of running sums, which are taken in disorder along a single long row alone.
+        # Torch warns about running sums, whose order only varies along a single long row.
         warnings.filterwarnings("ignore", message="cumsum_cuda_kernel does not have")
         torch.use_deterministic_algorithms(True, warn_only=True)
         torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]

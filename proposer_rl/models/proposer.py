@@ -14,7 +14,7 @@ from proposer_rl.models.actor_critic import ActorCritic, orthogonal_
 
 
 class MapEncoder(nn.Sequential):
-    """A convolutional encoder of probes that are maps.
+    """Encodes probes that are maps by convolutions.
 
     Args:
         in_channels: channels of a probe, e.g. its planes and the Solver's logit map.
@@ -39,9 +39,9 @@ class MapEncoder(nn.Sequential):
 class ProposerNetwork(nn.Module):
     """Maps observations to the parameters of the action distribution and to a value.
 
-    An encoder reads each probe; the mean over the probes, joined by whatever else is observed, is
-    the context g (the paper's Proposer, section 4). ``head`` makes the policy of g, an MLP the
-    value. Weights of encoder and value begin orthogonal, biases at zero.
+    An encoder reads each probe; the mean over the probes, together with the other observations, is
+    the context g (the paper's Proposer, section 4). ``head`` turns g into the policy, an MLP turns
+    it into the value. Weights of encoder and value are initialised orthogonally, biases with zero.
 
     Args:
         head: from contexts [*B, width] to the parameters of the action's distribution; see
@@ -49,7 +49,7 @@ class ProposerNetwork(nn.Module):
         encoder: from probes [*B, ...] of any kind to their features [*B, context]: a
             :class:`MapEncoder` for maps, an MLP for vectors.
         context: number of the encoder's features; the context g is ``context + numbers`` wide.
-        numbers: how many numbers are observed beside the probes.
+        numbers: how many numbers are observed besides the probes.
         hidden: width of the value's MLP.
     """
 

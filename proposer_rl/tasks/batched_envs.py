@@ -111,8 +111,8 @@ class BatchedEnv(EnvBase):
         ends = {key: flag.clone() for key in ("done", "terminated", "truncated")}
         self.done_spec = Composite(ends, shape=batch).to(self.device)
         self._next = {
-            str(name): self._number(entry).to(self.device, copy=True)
-            for name, entry in levels.items()
+            str(name): (one.float() if one.is_floating_point() else one).to(self.device, copy=True)
+            for name, one in levels.items()
         }
         self._level = {name: entry.clone() for name, entry in self._next.items()}
 
@@ -205,10 +205,6 @@ class BatchedEnv(EnvBase):
         if not self.draws:
             return steps.new_zeros(*self.batch_size, 0, dtype=torch.float32)
         return uniform(self._level[SEED].unsqueeze(-1), steps, self.draws)
-
-    @staticmethod
-    def _number(entry: Tensor) -> Tensor:
-        return entry.float() if entry.is_floating_point() else entry
 
     def _set_seed(self, seed: int | None) -> None:
         """Does nothing: random numbers come from the levels' seeds."""
@@ -305,8 +301,7 @@ class BatchedTask(Task):
     @property
     def about(self) -> dict[str, str]:
         """Returns facts about the task for readers, by their labels."""
-        target = "; ".join(f"{name} {bins}" for name, bins in self.target.bins.items())
-        return {"Target": target, **super().about}
+        return {"Target": str(self.target), **super().about}
 
     def environment(self, levels: TensorDictBase) -> EnvBase:
         """Returns an environment of levels [*B]."""

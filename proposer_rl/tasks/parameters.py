@@ -62,15 +62,14 @@ class Bins:
     @property
     def texts(self) -> list[str]:
         """Returns names of the parts, with enough digits to tell them apart."""
-        ends = [*zip(self.low.tolist(), self.high.tolist(), strict=True)]
-        for digits in (4, 17):
-            texts = [
-                f"{a:.{digits}g}" if a == b else f"{a:.{digits}g} to {b:.{digits}g}"
-                for a, b in ends
-            ]
-            if len({*texts}) == len(texts):
-                break
-        return texts
+        texts = self._names(4)
+        return texts if len({*texts}) == len(texts) else self._names(17)
+
+    def _names(self, digits: int) -> list[str]:
+        ends = zip(self.low.tolist(), self.high.tolist(), strict=True)
+        return [
+            f"{a:.{digits}g}" if a == b else f"{a:.{digits}g} to {b:.{digits}g}" for a, b in ends
+        ]
 
     @cached_property
     def wide(self) -> bool:
@@ -187,8 +186,7 @@ class Bins:
         return self.on_scale(self.low[0]), self.on_scale(self.high[-1])
 
     def __str__(self) -> str:
-        ends = zip(self.low.tolist(), self.high.tolist(), strict=True)
-        text = " or ".join(f"{a:g}" if a == b else f"{a:g} to {b:g}" for a, b in ends)
+        text = " or ".join(self._names(6))
         return f"{text} (log scale)" if self.log and self.wide else text
 
 
@@ -426,6 +424,9 @@ class ParameterSpace:
                 old = levels[name]
                 levels[name] = part.moved(old, noise).where(which == i, old)
         return levels.to(self._device)
+
+    def __str__(self) -> str:
+        return "; ".join(f"{name} {part}" for name, part in self.bins.items()) or "any level"
 
     def _drawn_seeds(self, shape: torch.Size, generator: torch.Generator) -> dict[str, Tensor]:
         if not self._seeded:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -164,17 +164,17 @@ class PointMassTask(BatchedTask):
         self, levels: TensorDictBase, rollout: TensorDictBase | None
     ) -> list[NDArray[np.uint8]]:
         """Draws the walls of levels [n], and the mass's path in the first episode of [n, T]."""
-        gates = list(zip(levels["position"].tolist(), levels["width"].tolist(), strict=True))
-        if rollout is None:
-            return [gate_picture(x, width, []) for x, width in gates]
-        first = in_first_episode(rollout)
-        before, end = (part["observation"][..., [0, 2]] for part in (rollout, rollout["next"]))
-        ways = [torch.cat([b[:1], e[f]]) for b, e, f in zip(before, end, first, strict=True)]
-        return [gate_picture(*gate, way.tolist()) for gate, way in zip(gates, ways, strict=True)]
+        paths: list[Any] = [[]] * len(levels)
+        if rollout is not None:
+            first = in_first_episode(rollout)
+            before, end = (part["observation"][..., [0, 2]] for part in (rollout, rollout["next"]))
+            each = zip(before, end, first, strict=True)
+            paths = [torch.cat([b[:1], e[f]]).tolist() for b, e, f in each]
+        return list(map(gate_picture, levels["position"].tolist(), levels["width"].tolist(), paths))
 
 
 def gate_picture(
-    position: float, width: float, way: Sequence[Sequence[float]]
+    position: float, width: float, path: Sequence[Sequence[float]]
 ) -> NDArray[np.uint8]:
     """Draws a wall with its gate, the goal, and a path: uint8 [SIDE_PIXELS, SIDE_PIXELS, 3]."""
 
@@ -191,7 +191,7 @@ def gate_picture(
         if ends[0] < ends[1]:
             image.line([at(ends[0], 0.0), at(ends[1], 0.0)], (45, 45, 45), 4)
     dot(GOAL_PLACE, (230, 159, 0))
-    if way:
-        image.line([at(x, y) for x, y in way], (204, 121, 167), 2)
-        dot(way[-1], (0, 114, 178))
+    if path:
+        image.line([at(x, y) for x, y in path], (204, 121, 167), 2)
+        dot(path[-1], (0, 114, 178))
     return np.asarray(picture)

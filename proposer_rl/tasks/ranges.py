@@ -150,7 +150,7 @@ class Labelled(Bins):
 
     @property
     def texts(self) -> list[str]:
-        """Returns the labels as texts, with their places where two are alike."""
+        """Returns the labels as texts, with their places if two are alike."""
         texts = self.middles
         alike = len({*texts}) < len(texts)
         return [f"{place}: {text}" for place, text in enumerate(texts)] if alike else texts

@@ -157,7 +157,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             )
         self._teacher.drop(self._ticket)
 
-    def _set(self, how: Mapping[str, str]) -> None:
+    def _set(self, how: Any) -> None:
         """Sets attributes of the environment to the values of the level."""
         for name, path in how.items():
             with within(f"set.{name}={path!r}", ValueError):

@@ -60,7 +60,7 @@ def as_result(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float
         ArgumentError: as of :func:`~proposer_rl.teaching.numbers.as_numbers`.
     """
     if name == "rollout":
-        return value  # type: ignore[no-any-return]
+        return value
     given, counts = "return_" if name == "return" else name, name in COUNTS
     spread = shape == (1,) or (counts and shape != ())
     return as_numbers(given, value, shape, *BOUNDS.get(name, ()), whole=counts, spread=spread)

@@ -35,14 +35,12 @@ class Tally:
             self._drawn[name] += bins.bincount(minlength=len(self._texts[name]))
 
     def returned(self, tickets: int, returns: Any, success: Any = None) -> None:
-        """Counts the results of tickets, numbers or arrays."""
+        """Counts the results of tickets, arrays or NumPy's scalars."""
         self._returned += tickets
         for name, values in (("return", returns), ("success", success)):
             if values is not None:
                 total, number = self._sums.get(name, (0.0, 0))
-                more = getattr(values, "size", 1)
-                added = float(values.sum()) if hasattr(values, "sum") else values
-                self._sums[name] = total + added, number + more
+                self._sums[name] = total + float(values.sum()), number + values.size
 
     def dropped(self, tickets: int) -> None:
         """Counts tickets that were given up."""

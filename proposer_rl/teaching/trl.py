@@ -52,7 +52,8 @@ class TaughtReward(TrainerCallback):
         reward: Callable[..., Sequence[float | None]],
         source: str | None = None,
     ) -> None:
-        self._teacher, self._rows, self._reward = teacher, len(teacher.space.axes["item"]), reward
+        space: Any = teacher.space
+        self._teacher, self._rows, self._reward = teacher, space.size, reward
         self._source = source
         self._told = 0  # number of generations
         self._again = False  # whether the next one repeats the last that was told

@@ -31,7 +31,8 @@ def teacher_calls(options: Options) -> Result:
     space = Parameters({"gravity": (5.0, 25.0), "walls": range(60)}, bins=8)
     ways: dict[str, Callable[[], None]] = {}
     for name, way in (("one by one", _one_by_one), (f"{MANY} at once", _at_once)):
-        teacher = Teacher(curricula.plr(capacity=count if options.tiny else SLOTS), space)
+        recipe = curricula.plr(capacity=count if options.tiny else SLOTS)
+        teacher = Teacher(recipe, space, block=BATCH)
         _at_once(teacher, count)
         _at_once(teacher, count)
         ways[name] = partial(way, teacher, count)
@@ -68,7 +69,8 @@ def adaptive_mixture(options: Options) -> list[Row]:
         ways[name] = partial(_batch, Teacher(curricula.adaptive_mixture(), space), BATCH)
         per[name], targets[name] = 1, OF_A_PROPOSAL
         name = f"ask and tell with {size} ranges, one by one, each"
-        ways[name] = partial(_one_by_one, Teacher(curricula.adaptive_mixture(), space), count)
+        teacher = Teacher(curricula.adaptive_mixture(), space, block=BATCH)
+        ways[name] = partial(_one_by_one, teacher, count)
         per[name], targets[name] = count, OF_A_PAIR
     prompts = prompts_of(items)
     name = f"a step of {count} of {items:,} items with {FEATURES} features"

@@ -8,18 +8,12 @@ from typing import Any
 import torch
 
 from proposer_rl import curricula as c
+from proposer_rl import models
 from proposer_rl.curricula import Curriculum, ReplayCurriculum, ReplayRule, Scorer
 from proposer_rl.learning import PPOSettings
 from proposer_rl.meta.assembly import ProposerSettings
 from proposer_rl.meta.rewards import log_success_gain
 from proposer_rl.methods import Components, proposer
-from proposer_rl.models import (
-    ActorCritic,
-    ProblemHead,
-    ProposerNetwork,
-    categorical,
-    proposer_actor_critic,
-)
 from proposer_rl.streams import Streams
 from tests.curricula.living import TASK
 
@@ -51,11 +45,11 @@ def selection(source: Any = "exact", rollouts: int = 2, **options: Any) -> c.Sel
     return c.SelectionCurriculum(SPACE, Scorer("learnability", source, rollouts), **numbers)
 
 
-def problem_agent() -> ActorCritic:
+def problem_agent() -> models.ActorCritic:
     torch.manual_seed(0)
-    head = ProblemHead(8, P, SPACE.size, hidden=16, bands=4)
-    network = ProposerNetwork(head, TASK.probe_encoder(8), context=8, hidden=8)
-    return proposer_actor_critic(network, categorical)
+    head = models.ProblemHead(8, P, SPACE.size, hidden=16, bands=4)
+    network = models.ProposerNetwork(head, TASK.probe_encoder(8), context=8, hidden=8)
+    return models.proposer_actor_critic(network, models.categorical)
 
 
 def paired(streams: Streams | None = None) -> c.PairedProposer:

@@ -79,7 +79,7 @@ def covariances(a: Tensor, b: Tensor, weight: Tensor) -> tuple[float, float, flo
     return float(found[0, 1]), float(found[0, 0]), float(found[1, 1])
 
 
-def by_hand(seen: list[Any], told: bool) -> list[float]:
+def by_hand(seen: list[Any], told: bool, concentrate: bool) -> list[float]:
     """Returns the shares after a history, from weights by age: the module's formulas."""
     returns = torch.cat([outcome["return"] for _, outcome in seen])
     rows: list[tuple[float, int, float, float, float]] = []  # batch, arm, label, predicted, return
@@ -113,26 +113,42 @@ def by_hand(seen: list[Any], told: bool) -> list[float]:
     )
     skill = covered / math.sqrt((predicted_square + 0.05) * (label_square + 0.5))
     low = FLOOR + (LOW - FLOOR) * min(2 * signal, 1)
-    t = low + (HIGH - low) * b / (b + (0.1 if told else 0.5))
-    q = min(max(0.4 + skill / 2, 0.2), 0.8)
+    half, q = 0.1 if told else 0.5, min(max(0.4 + skill / 2, 0.2), 0.8)
+    if told and concentrate:
+        uniform_dense, target_dense = (
+            min(
+                4
+                * math.sqrt(variance(returns, (arm == i) * (1 - label)) / variance(returns, every)),
+                1,
+            )
+            for i in (UNIFORM, TARGET)
+        )
+        solved = float((weight * uniform * label).sum() / (weight * uniform).sum())
+        c = min(max((0.4 - solved) / 0.2, 0), 1) * (1 - uniform_dense)
+        low, q = low + c * (0.05 - low), q + c * (0.95 - q)
+        half = 0.4 - 0.3 * target_dense
+    t = low + (HIGH - low) * b / (b + half)
     return [t, (1 - t) * (1 - q), (1 - t) * q]
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_shares_are_those_of_the_formulas(told: bool) -> None:
+@pytest.mark.parametrize(
+    ("told", "concentrate", "scale"),
+    [(True, False, 1), (False, False, 1), (False, True, 1), (True, True, 0.3), (True, True, 1)],
+)
+def test_shares_are_those_of_the_formulas(told: bool, concentrate: bool, scale: float) -> None:
     """A target that is solved a little at times, not at all in between, and always in the end."""
 
     def play(levels: Any, generator: torch.Generator) -> Reached:
         x = levels["x"]
-        limit = 1.1 if now == 1 else 0.5 + now / 40 if now < 12 else 1.4
+        limit = 1.1 if now == 1 else 0.3 + now / 40 if now < 12 else 1.4
         won = (x + 0.3 * torch.rand(len(x), generator=generator) < limit).double()
-        return {"return": 3 * won - x, **({"success": won} if told else {})}
+        return {"return": 3 * won - scale * x, **({"success": won} if told else {})}
 
-    curriculum, seen = AdaptiveMixture(LINE, LINE.target), []
+    curriculum, seen = AdaptiveMixture(LINE, LINE.target, concentrate=concentrate), []
     for now in range(16):
         seen += teach(curriculum, play, 1, 24 if told else 70, now)  # more than a thousand in all
         log = following(curriculum)[1]
-        expected = by_hand(seen, told)
+        expected = by_hand(seen, told, concentrate)
         shares = [log["shares"][arm] for arm in ("target", "uniform", "bridge")]
         assert shares == pytest.approx(expected, abs=1e-9)
 
@@ -446,6 +462,77 @@ def test_where_skill_grows_at_its_frontier_it_beats_uniform_levels_and_the_targe
 def test_where_the_target_alone_teaches_it_is_nearly_as_fast() -> None:
     adaptive, uniform, target = compared(True, 0.9, 120)
     assert adaptive < 2 * target < uniform, (adaptive, uniform, target)
+
+
+CUBE = prl.Parameters({name: (0.0, 1.0) for name in "xyz"}, target=dict.fromkeys("xyz", 1.0))
+
+
+def reached(skill: float, width: float = 0.04) -> Plays:
+    """Sparse success where the largest of three numbers is below a skill."""
+
+    def play(levels: Any, generator: torch.Generator) -> Reached:
+        p = ((skill - torch.stack([*levels.values()], -1).amax(-1)) / width).sigmoid()
+        won = (torch.rand(len(p), generator=generator) < p).double()
+        return {"return": won, "success": won}
+
+    return play
+
+
+def test_the_bridge_is_concentrated_where_uniform_levels_are_seldom_solved() -> None:
+    """Of sparse success: in one of a hundred, by a third, and in most of uniform levels."""
+    found = {}
+    for skill in (0.2, 0.66, 0.95):
+        curriculum = AdaptiveMixture(CUBE, CUBE.target, concentrate=True)
+        teach(curriculum, reached(skill), 30)
+        batch, log = following(curriculum, 64)
+        solved = float(reached(skill)(batch.levels, torch.Generator())["success"].mean())
+        found[skill] = log["concentration"], log["shares"]["bridge"], solved
+    assert found[0.2][0] == 1 and found[0.2][1] == pytest.approx(0.95 * 0.95, abs=1e-6)
+    assert 0 < found[0.66][0] < 1 and found[0.95][0] == 0
+    earlier = AdaptiveMixture(CUBE, CUBE.target)
+    teach(earlier, reached(0.2), 30)
+    batch, _ = following(earlier, 64)
+    before = float(reached(0.2)(batch.levels, torch.Generator())["success"].mean())
+    assert found[0.2][2] > 2 * before
+
+
+@pytest.mark.parametrize("case", ["dense", "not told", "data"])
+def test_nothing_is_concentrated_where_every_episode_teaches(case: str) -> None:
+    """Batches are those of the mixture that never concentrates, to the last digit."""
+    space = (
+        prl.Items(64, features=torch.linspace(0, 1, 64).unsqueeze(-1)) if case == "data" else CUBE
+    )
+    target = getattr(space, "distributions", {}).get("target")
+
+    def play(levels: Any, generator: torch.Generator) -> Reached:
+        if case == "data":
+            won = (levels["item"] < 3).double()
+            return {"return": won, "success": won}
+        won = reached(0.2)(levels, generator)["success"]
+        dense = {"return": won + torch.rand(len(won), generator=generator), "success": won}
+        return dense if case == "dense" else {"return": won}
+
+    made = [AdaptiveMixture(space, target, concentrate=one) for one in (False, True)]
+    ours, theirs = (torch.cat([b.levels for b, _ in teach(one, play, 12)]) for one in made)
+    assert all((ours[name] == theirs[name]).all() for name in ours.keys())
+
+
+def test_levels_that_come_back_are_not_repeated_by_a_concentrated_bridge() -> None:
+    """The share of a target that is solved at times still rises later where rewards are sparse."""
+    kinds = prl.Parameters({"x": [*range(20)]}, target={"x": 19})
+    logs = []
+    for concentrate in (False, True):
+        curriculum = AdaptiveMixture(kinds, kinds.target, concentrate=concentrate)
+
+        def play(levels: Any, generator: torch.Generator) -> Reached:
+            chance = torch.rand(len(levels), generator=generator)
+            won = ((levels["x"] < 2) | ((levels["x"] == 19) & (chance < 0.3))).double()
+            return {"return": won, "success": won}
+
+        teach(curriculum, play, 12)
+        logs.append(following(curriculum)[1])
+    assert [log["concentration"] for log in logs] == [0, 0]
+    assert logs[1]["shares"]["target"] < logs[0]["shares"]["target"] - 0.1
 
 
 def test_the_brier_score_is_of_success_also_where_the_belief_learns_from_returns() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf, isfinite
 from typing import Any
 
 import pytest
@@ -94,17 +95,6 @@ def test_shares_are_a_distribution_that_follows_the_scores(
         torch.testing.assert_close(score_weights(score[order], full, rule), weight[order])
 
 
-@pytest.mark.parametrize("kind", ["rank", "proportional", "softmax"])
-def test_temperature_goes_from_the_best_alone_to_all_alike(kind: Any) -> None:
-    positive, five = SCORE + 0.3, torch.full((5,), 0.2, dtype=torch.float64)
-    hot = score_weights(positive, FULL, ReplayRule(prioritization=kind, temperature=1e6))
-    torch.testing.assert_close(hot, five, atol=1e-5, rtol=0)
-    cold = score_weights(positive, FULL, ReplayRule(prioritization=kind, temperature=1e-2))
-    assert cold[0] > 1 - 1e-9
-    same = score_weights(torch.zeros(5), FULL, ReplayRule(prioritization=kind))
-    torch.testing.assert_close(same, five)
-
-
 def levels(*numbers: int) -> TensorDict:
     """Levels [n] that are equal where their numbers are."""
     count = len(numbers)
@@ -142,20 +132,27 @@ class Simulation:
         rho, total = self.rule.staleness, sum(weight)
         return [(1 - rho) * w / total + rho * u for w, u in zip(weight, stale, strict=True)]
 
-    def insert(self, number: int, score: float) -> None:
-        self.clock += 1
-        here = {"number": number, "score": score, "touched": self.clock}
-        for i, slot in enumerate(self.slots):
-            if slot["number"] == number:
-                self.slots[i] = here
-                return
-        if len(self.slots) < self.capacity:
-            self.slots.append(here)
-            return
-        shares = self.shares()
-        worst = shares.index(min(shares))
-        if score > self.slots[worst]["score"]:
-            self.slots[worst] = here
+    def insert(self, batch: list[tuple[int, float]]) -> None:
+        """Equal levels have the mean of their finite scores; without any they are not kept."""
+        for number, _ in batch:
+            self.clock += 1
+            own = [score for other, score in batch if other == number]
+            if not (known := [score for score in own if isfinite(score)]):
+                continue
+            here = {"number": number, "score": sum(known) / len(known), "touched": self.clock}
+            here |= {"best": max(own), "draws": 0}
+            there = [i for i, slot in enumerate(self.slots) if slot["number"] == number]
+            if there:
+                slot = self.slots[there[0]]
+                kept = {"best": max(slot["best"], here["best"]), "draws": slot["draws"]}
+                self.slots[there[0]] = {**here, **kept}
+            elif len(self.slots) < self.capacity:
+                self.slots.append(here)
+            else:
+                shares = self.shares()
+                worst = shares.index(min(shares))
+                if here["score"] > self.slots[worst]["score"]:
+                    self.slots[worst] = here
 
     def draw(self, mark: float) -> int:
         chosen, total = 0, 0.0
@@ -166,6 +163,7 @@ class Simulation:
                 break
         self.clock += 1
         self.slots[chosen]["touched"] = self.clock
+        self.slots[chosen]["draws"] += 1
         return chosen
 
 
@@ -184,17 +182,17 @@ def test_it_does_what_a_plain_simulation_does(data: st.DataObject) -> None:
             slots = draw_slots(buffer, 3, rule, generator.manual_seed(step))
             assert slots.tolist() == [plain.draw(mark) for mark in marks]
         else:
-            numbers = data.draw(st.lists(st.integers(0, 9), min_size=1, max_size=4, unique=True))
-            score = [data.draw(st.integers(-4, 4)) / 4 for _ in numbers]
+            numbers = data.draw(st.lists(st.integers(0, 9), min_size=1, max_size=4))
+            values = st.integers(-4, 4).map(lambda x: x / 4) | st.just(-inf)
+            score = [data.draw(values) for _ in numbers]
             insert(buffer, new(numbers, score), rule)
-            for number, value in zip(numbers, score, strict=True):
-                plain.insert(number, value)
+            plain.insert([*zip(numbers, score, strict=True)])
         n = len(plain.slots)
         assert buffer["filled"].tolist() == [True] * n + [False] * (capacity - n)
         here = buffer[:n]
         assert here["level", "a"].tolist() == [slot["number"] for slot in plain.slots]
-        assert here["score"].tolist() == [slot["score"] for slot in plain.slots]
-        assert here["touched"].tolist() == [slot["touched"] for slot in plain.slots]
+        for name in ("score", "touched", "best", "draws"):
+            assert here[name].tolist() == [slot[name] for slot in plain.slots]
         assert len(set(here["key"].tolist())) == n  # no two equal levels
 
 
@@ -208,31 +206,6 @@ def test_what_is_evicted_leaves_nothing_behind() -> None:
     assert (int(row["draws"]), int(row["parent"]), int(row["generation"])) == (0, 77, 4)
     assert float(row["best"]) == pytest.approx(0.3)
     assert int(row["touched"]) == int(buffer["clock"][1]) == 2 + 5 + 1  # age 0
-
-
-def test_what_was_reached_on_a_level_does_not_fall_when_it_comes_again() -> None:
-    buffer = filled([1, 2], [0.9, 0.1], 4, RANK)
-    insert(buffer, new([1, 2], [0.2, 0.8]), RANK)
-    assert buffer["score"][:2].tolist() == pytest.approx([0.2, 0.8])
-    assert buffer["best"][:2].tolist() == pytest.approx([0.9, 0.8])
-
-
-def test_a_level_that_does_not_beat_the_worst_is_not_kept() -> None:
-    rule = replace(RANK, staleness=0.0)
-    buffer = filled([1, 2], [0.5, 0.1], 2, rule)
-    for score in (0.1, -torch.inf, torch.nan):
-        insert(buffer, new([3], [score]), rule)
-        assert buffer["level", "a"].tolist() == [1, 2]
-
-
-def test_equal_levels_of_a_batch_count_once_in_any_order() -> None:
-    for numbers, score in (([7, 8, 7], [0.2, 0.9, 0.6]), ([7, 7, 8], [0.6, 0.2, 0.9])):
-        buffer = filled(numbers, score, 5, RANK)
-        assert int(buffer["filled"].sum()) == 2
-        seven = buffer[buffer["level", "a"] == 7]
-        assert float(seven["score"]) == pytest.approx(0.4)
-    unfinished = filled([7, 8, 7], [-torch.inf, 0.9, 0.6], 5, RANK)  # as of no complete episode
-    assert float(unfinished["score"][unfinished["level", "a"] == 7]) == pytest.approx(0.6)
 
 
 def test_rescoring_takes_means_and_never_lowers_the_best_return() -> None:

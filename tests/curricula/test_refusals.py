@@ -47,9 +47,8 @@ REFUSED: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (bounds, {"lower": 0.6}, "lower=0.6: must be at most upper=0.5"),
     (rows, {"lower": 0.6}, "lower=0.6: must be at most upper=0.5"),
     (rows, {"row": "level"}, "row=level: unknown; there are: obstacle fraction, path length"),
-    (c.RowsCurriculum, {"space": ONE_ROW}, "row=row: has a single row; give it bins"),
+    (c.RowsCurriculum, {"space": ONE_ROW}, "row=row: has a single row; give the axis bins"),
     (replay, {"train_on_new": True, "synchronous": True}, "train_on_new=true, synchronous=true: "),
-    (replay, {"co_learnability": 1.0, "renew": True}, r"co_learnability=1\.0, renew=true: "),
     (no_edits, {"edits": 1}, "edits=1: the task must define edit"),
     (replay, {"new_levels": {"walls": [1]}}, r"new_levels.walls=\[1.0\]: must be among"),
     (replay, {"new_levels": {"path length": []}}, r"new_levels.path length=\[\]: "),
@@ -66,7 +65,7 @@ REFUSED: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     *((make, {"space": ONE}, SINGLE) for make in (c.LearningProgressCurriculum, Mixture)),
     (first_order, {"space": ONE}, SINGLE),
     (rounded, {"space": SEEDS, "rounded": False}, SINGLE),
-    (rounded, {"space": ONE}, r"rounded=true: .* its axes bins, or rounded=false"),
+    (rounded, {"space": ONE}, r"rounded=true: .* its axes bins, or set rounded=false"),
     (partial(c.TransportCurriculum, MANY, torch.ones(5000)), {}, "5,000 bins: .* on more than 256"),
     *(
         (make, {"space": WIDE}, "134,217,728 bins: at most 100,000,000")

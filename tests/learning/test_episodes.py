@@ -9,27 +9,22 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from proposer_rl.learning import first_episode_return, first_episode_success
-from proposer_rl.meta.rewards import (
-    TrainingStep,
-    log_success_gain,
-    performance_gain,
-    task_difficulty,
-)
+from proposer_rl.meta import rewards
 
 
-def step(before: dict[str, list[float]], after: dict[str, list[float]]) -> TrainingStep:
+def step(before: dict[str, list[float]], after: dict[str, list[float]]) -> rewards.TrainingStep:
     """What one Solver reaches on its levels before and after an update."""
     reached = ({n: torch.tensor([entry]) for n, entry in told.items()} for told in (before, after))
     performances = (TensorDict(told, next(iter(told.values())).shape) for told in reached)
-    return TrainingStep(None, None, None, *performances)  # type: ignore[arg-type]
+    return rewards.TrainingStep(None, None, None, *performances)  # type: ignore[arg-type]
 
 
 def test_gains_are_the_increase_of_a_mean() -> None:
     """Of the return, or of the logarithm of the chance of success, and 0.001."""
     given = step({"return": [0.1, 0.3]}, {"return": [0.5, 0.3]})
-    torch.testing.assert_close(performance_gain(given), torch.tensor([0.2]))
+    torch.testing.assert_close(rewards.performance_gain(given), torch.tensor([0.2]))
     given = step({"success": [0.0, 0.009]}, {"success": [0.0, 0.999]})
-    torch.testing.assert_close(log_success_gain(given), torch.tensor([math.log(100) / 2]))
+    torch.testing.assert_close(rewards.log_success_gain(given), torch.tensor([math.log(100) / 2]))
 
 
 def rollout(*episodes: str) -> TensorDict:
@@ -44,8 +39,8 @@ def rollout(*episodes: str) -> TensorDict:
 
 def test_difficulty_is_the_failure_rate() -> None:
     batch = rollout("..G.", "..TG", "....", "G.T.")
-    given = TrainingStep(None, batch, None, None, None)  # type: ignore[arg-type]
-    torch.testing.assert_close(task_difficulty(given), torch.tensor([0.5]))
+    given = rewards.TrainingStep(None, batch, None, None, None)  # type: ignore[arg-type]
+    torch.testing.assert_close(rewards.task_difficulty(given), torch.tensor([0.5]))
 
 
 def test_only_the_first_episode_counts() -> None:

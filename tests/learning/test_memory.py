@@ -13,12 +13,7 @@ from proposer_rl.learning import PPO, PPOSettings
 from proposer_rl.learning.rollout import set_values
 from proposer_rl.meta.first_order import surrogate
 from proposer_rl.models import Population, memory_actor_critic
-from proposer_rl.tasks.view_mazes.view_env import (
-    VIEW_ENTRIES,
-    ViewMazeEnv,
-    ViewNetworkSettings,
-    view_network,
-)
+from proposer_rl.tasks.view_mazes import view_env
 from tests.draws import generators
 from tests.tasks.view_mazes.oracles import random_levels
 
@@ -31,12 +26,12 @@ def learner(copies: range = range(K), settings: PPOSettings = SETTINGS, **how: A
 
     def make() -> torch.nn.Module:
         torch.manual_seed(next(seeds))
-        return view_network(ViewNetworkSettings(channels=4, memory=M, head=8))
+        return view_env.view_network(view_env.ViewNetworkSettings(channels=4, memory=M, head=8))
 
     population = Population(make, len(copies), **how)
-    agent = memory_actor_critic(population, VIEW_ENTRIES, M)
+    agent = memory_actor_critic(population, view_env.VIEW_ENTRIES, M)
     levels = random_levels(K * P, side=5).reshape(K, P)[list(copies)]
-    return PPO(ViewMazeEnv(levels, max_steps=6), agent, settings)
+    return PPO(view_env.ViewMazeEnv(levels, max_steps=6), agent, settings)
 
 
 def through_time(ppo: PPO, rollout: TensorDict) -> TensorDict:

@@ -15,11 +15,9 @@ from proposer_rl.curricula import TaskStudent
 from proposer_rl.learning import PPO, PPOSettings, SolverSettings, agent_weights, load_agent
 from proposer_rl.meta.first_order import LevelGradients
 from proposer_rl.models.actor_critic import FARTHEST, RunningMoments
-from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from tests.draws import generators
 from tests.tasks.gymnasium.toys import walk_task
-from tests.tiny import tiny_task
 
 K, P, T = 2, 3, 5
 SETTINGS = PPOSettings(
@@ -165,11 +163,3 @@ def test_the_moments_belong_to_what_is_stored(trained: Any) -> None:
     assert (performances[0] == performances[1]).all()
     fresh.restore(learner.snapshot())
     assert (fresh.snapshot() == learner.snapshot()).all()
-
-
-def test_what_cannot_be_normalised_is_refused() -> None:
-    for name in ("normalize_observations", "normalize_rewards"):
-        ppo = PPOSettings(horizon=T, **{name: True})
-        task = tiny_task(solver=SolverSettings(batch_size=P, ppo=ppo))
-        with pytest.raises(ArgumentError, match=f"^{name}=True: this Solver reads its level"):
-            task.learner([Streams(0)])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import pytest
 import torch
@@ -81,9 +82,7 @@ def test_each_step_is_in_one_part_of_its_own_replica(make: Callable[..., PPO]) -
     assert torch.equal(torch.cat(drawn, 1).sort().values, number.flatten(1))
 
 
-def test_one_shuffled_part_gives_the_gradient_of_the_whole_batch(
-    make: Callable[..., PPO],
-) -> None:
+def test_one_shuffled_part_gives_the_gradient_of_the_whole_batch(make: Callable[..., PPO]) -> None:
     ppo = make(replace(SETTINGS, minibatches=1))
     rollout = ppo.update(
         generators(*range(K))
@@ -114,11 +113,21 @@ def test_a_single_agent_in_a_single_environment_trains_on_minibatches() -> None:
     assert {float(each["step"]) for each in ppo.snapshot().values()} == {6.0}
 
 
-def test_more_parts_than_there_are_are_refused() -> None:
-    with pytest.raises(ArgumentError, match=r"^minibatches=7: must be at most the 6 sequences of"):
-        of_maze(replace(SETTINGS, minibatches=7), False)
-    with pytest.raises(ArgumentError, match=r"^minibatches=73: must be at most the 72 steps of"):
-        of_maze(replace(SETTINGS, minibatches=73), True)
+@pytest.mark.parametrize(
+    ("name", "value", "per_step", "why"),
+    [
+        ("minibatches", 7, False, "must be at most the 6 sequences of"),
+        ("minibatches", 73, True, "must be at most the 72 steps of"),
+        ("continue_episodes", True, False, "this Solver reads its level once"),
+        ("normalize_observations", True, False, "this Solver reads its level once"),
+        ("normalize_rewards", True, False, "this Solver reads its level once"),
+    ],
+)
+def test_settings_that_a_solver_cannot_follow_are_refused(
+    name: str, value: Any, per_step: bool, why: str
+) -> None:
+    with pytest.raises(ArgumentError, match=f"^{name}={value}: {why}"):
+        of_maze(replace(SETTINGS, **{"minibatches": 1, name: value}), per_step)
 
 
 def test_the_learning_rate_falls_to_zero_in_equal_steps() -> None:

@@ -32,9 +32,7 @@ def test_problem_choices_are_the_action() -> None:
 
 
 @given(
-    st.lists(st.floats(-3, 3), min_size=2, max_size=6),
-    st.integers(1, 40),
-    st.integers(0, 10**6),
+    st.lists(st.floats(-3, 3), min_size=2, max_size=6), st.integers(1, 40), st.integers(0, 10**6)
 )
 def test_a_mixtures_choices_occur_as_often_as_their_shares_say(
     logits: list[float], count: int, seed: int

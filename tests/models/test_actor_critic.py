@@ -88,8 +88,7 @@ def test_cell_maps_are_what_the_solver_says_at_each_cell(per_step: bool) -> None
 
 
 @given(
-    st.lists(st.floats(-5, 5), min_size=2, max_size=6),
-    st.floats(0, 1, exclude_max=True, width=32),
+    st.lists(st.floats(-5, 5), min_size=2, max_size=6), st.floats(0, 1, exclude_max=True, width=32)
 )
 def test_draw_inverts_the_cumulative_distribution(logits: list[float], uniform: float) -> None:
     distribution = models.categorical(torch.tensor(logits, dtype=torch.float64))

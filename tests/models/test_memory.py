@@ -126,12 +126,6 @@ def test_an_episode_knows_nothing_of_the_one_before() -> None:
     assert not torch.equal(one[:, :, 4], another[:, :, 4])
 
 
-def test_memory_begins_at_zero() -> None:
-    memory = agent().no_memory(steps()[:, :, 0])
-    assert list(memory.keys()) == list(MEMORY) and memory.batch_size == (K, N)
-    assert all(not memory[key].any() and memory[key].shape == (K, N, M) for key in MEMORY)
-
-
 @torch.no_grad()
 def test_with_its_primer_it_remembers_in_rollouts_and_collectors_of_torchrl() -> None:
     solvers = tiny_view_task().learner([Streams(0, k) for k in range(2)])

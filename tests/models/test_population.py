@@ -66,18 +66,6 @@ def test_outputs_and_gradients_equal_those_of_networks_apart(make, shape, copies
                 assert stacked.grad is None or not stacked.grad.any()
 
 
-def test_copies_on_cores_leave_no_gradient_behind_and_repeat_bit_for_bit() -> None:
-    population, planes = together(6, cores=4), torch.rand(6, 4, 3, 6, 6)
-    runs = []
-    for _ in range(3):
-        outputs = population(planes)
-        loss = sum(output.square().sum() for output in outputs)
-        runs.append([*outputs, *torch.autograd.grad(loss, list(population.stacked))])
-    assert all(parameter.grad is None for parameter in population.stacked)
-    for run in runs[1:]:
-        assert all(torch.equal(one, other) for one, other in zip(run, runs[0], strict=True))
-
-
 @pytest.mark.parametrize("way", WAYS)
 def test_gradients_can_be_taken_one_after_another(way: dict) -> None:
     population, planes = together(3, **way), torch.rand(3, 4, 3, 6, 6)

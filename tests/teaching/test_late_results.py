@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from torch.utils._pytree import tree_map_only
 
 import proposer_rl as prl
-from proposer_rl.curricula import Curriculum
 from proposer_rl.settings import ArgumentError
 from tests.curricula.test_contract import same
 from tests.teaching.counting import ITEMS, Counting, through_torch
@@ -154,14 +154,6 @@ class Elsewhere(torch.Tensor):
         return super().__torch_function__(function, types, args, more or {})
 
 
-def elsewhere(state: Any) -> Any:
-    if isinstance(state, dict):
-        return {name: elsewhere(entry) for name, entry in state.items()}
-    if isinstance(state, list):
-        return [*map(elsewhere, state)]
-    return state.as_subclass(Elsewhere) if isinstance(state, torch.Tensor) else state
-
-
 def test_a_state_may_have_been_mapped_to_another_device() -> None:
     """Against one that was not; what is pretended here is ``map_location="cuda"``."""
     recipe = prl.curricula.plr(capacity=16, fill=0.5)
@@ -171,7 +163,7 @@ def test_a_state_may_have_been_mapped_to_another_device() -> None:
         teacher.tell(ids[1:], levels[1:].double())
     state = through_torch(teacher.state_dict())
     other = prl.Teacher(recipe, ITEMS, block=8)
-    other.load_state_dict(elsewhere(state))
+    other.load_state_dict(tree_map_only(torch.Tensor, lambda x: x.as_subclass(Elsewhere), state))
     assert same(teacher.state_dict(), other.state_dict())
     assert all((teacher.ask(9)[i] == other.ask(9)[i]).all() for i in (0, 1))
 
@@ -199,10 +191,7 @@ def test_numbers_may_be_of_any_kind() -> None:
 def test_one_number_of_episodes_stands_for_all_tickets() -> None:
     seen = []
 
-    class Spy(Curriculum):
-        def propose(self, student: Any, count: int, rng: Any) -> TensorDict:
-            return TensorDict({"item": torch.zeros(count, dtype=torch.int64)}, [count])
-
+    class Spy(Counting):
         def observe(self, student: Any, batch: Any, outcome: Any) -> None:
             seen.append([outcome[name].tolist() for name in ("return", "episodes", "steps")])
 

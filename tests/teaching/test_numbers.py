@@ -1,4 +1,4 @@
-"""Numbers and lists of other libraries, and those that are too large, in spaces and results."""
+"""Numbers and lists of other libraries in spaces and results, and what becomes of features."""
 
 from __future__ import annotations
 
@@ -18,11 +18,15 @@ from hypothesis import given
 from hypothesis import settings as profile
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
+from scipy.stats import rankdata
+from sklearn.decomposition import PCA
 from tensordict import TensorDict
 
 import proposer_rl as prl
+from proposer_rl.curricula.belief import WIDEST
 from proposer_rl.settings import ArgumentError
 from proposer_rl.tasks.ranges import RangeSettings, spaces
+from proposer_rl.teaching.tables import few_columns, ranks
 from tests.teaching.counting import Counting
 
 NAN, INF, HUGE = float("nan"), float("inf"), 1e39  # finite in float64, not in float32
@@ -71,7 +75,9 @@ def test_texts_may_be_in_any_list(kind: str) -> None:
     assert space.distributions["both"].size == 2  # type: ignore[attr-defined]
 
 
-def test_choices_that_are_arrays_stay_what_they_are() -> None:
+def test_choices_that_are_arrays_or_lists_stay_what_they_are() -> None:
+    lists = prl.Parameters({"size": [[1, 2], [3, 4]]}, target={"size": [[3, 4]]})
+    assert lists.target_shares.tolist() == [0, 1]
     mazes = [np.eye(2), np.ones((2, 2))]
     assert all(
         any(level["maze"] is m for m in mazes) for level in levels(prl.Parameters({"maze": mazes}))
@@ -155,6 +161,7 @@ TARGETS = [np.array([1, 2]), torch.tensor([1, 2]), range(1, 3), pd.Series([1, 2]
 def test_places_of_items_may_be_in_any_list(target: Any) -> None:
     assert prl.Items(np.int64(3), target=target).target_shares.tolist() == [0, 0.5, 0.5]
     assert prl.Items(3, target=np.int64(2)).target_shares.tolist() == [0, 0, 1]
+    assert prl.Items(3, target=[1, 2, 2, 2]).target_shares.tolist() == [0, 0.25, 0.75]
 
 
 COLORS = pd.get_dummies(pd.Series(["red", "blue", "red"]))  # a table of truth values
@@ -351,3 +358,38 @@ def test_results_are_those_that_float32_can_keep(number: float) -> None:
         except ArgumentError as error:
             assert re.match(r"return_=\S+: must be finite in float32", str(error))
             assert not kept or abs(number) > np.finfo(np.float32).max
+
+
+@profile(max_examples=50)
+@given(st.lists(st.floats(-1e12, 1e12), min_size=1, max_size=9))
+def test_ranks_are_those_of_scipy(column: list[float]) -> None:
+    found = ranks(torch.tensor(column, dtype=torch.float64).unsqueeze(1))[:, 0]
+    expected = (2 * rankdata(column) - 1) / len(column) - 1
+    assert found.tolist() == pytest.approx(expected.tolist(), abs=1e-6)
+
+
+@pytest.mark.parametrize("last", [None, 0.8, float("nan")])
+def test_wide_features_leave_room_for_pass_rates(last: float | None) -> None:
+    generator = torch.Generator().manual_seed(0)
+    embedding = torch.randn(40, 60, generator=generator) * torch.linspace(0.1, 9, 60)
+    rates = None if last is None else [0.2] * 39 + [last]
+    items = prl.Items(40, features=embedding, pass_rates=rates)
+    known = items.inputs(items.generate(torch.arange(40), []))
+    assert known.shape == (40, WIDEST)  # a belief would project more, the rates among them
+    columns = {None: 0, 0.8: 1}.get(last, 2)  # the second says where there is no rate
+    torch.testing.assert_close(known[:, : WIDEST - columns], few_columns(embedding, columns))
+    for column in known[:, WIDEST - columns :].mT[-1:]:
+        assert column.tolist() == pytest.approx([-1 / 40] * 39 + [39 / 40])
+
+
+def test_wide_features_are_ranks_of_their_principal_components() -> None:
+    table = torch.randn(50, 30, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    table = table @ torch.randn(30, 30, generator=torch.Generator().manual_seed(2)).double()
+    own = ((table - table.mean(0)) / table.std(0)).clamp(-3, 3).numpy()
+    # They are not centred once more after outliers were cut off.
+    expected = PCA(WIDEST).fit_transform(own - own.mean(0))
+    found = few_columns(table)
+    for place in range(4):  # those that are far apart in variance; signs are free
+        twin = torch.from_numpy(rankdata(expected[:, place])).float()
+        alike = torch.corrcoef(torch.stack([found[:, place], twin]))[0, 1].abs()
+        assert float(alike) > 0.98

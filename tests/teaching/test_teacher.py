@@ -40,6 +40,7 @@ ITEMS = prl.Items(100)
 ONE: dict[str, Any] = {"slope": (0.0, 8.0)}
 SMALL = {"capacity": 32, "fill": 0.25}
 PROGRESS = prl.curricula.learning_progress(source="episodes")
+MODEL = prl.curricula.model_transport(labels="success")
 
 
 def plr(**settings: Any) -> prl.Teacher:
@@ -171,31 +172,25 @@ def drawn(shape: int, known: int = 0) -> prl.LevelGenerator:
 
 
 GROUND = ["flat", "stairs", "gap"]
+EYE = prl.Items(100, features=torch.eye(100))
+MORE = prl.Parameters({**ONE, "wind": range(9)}, bins=4)
+ORDERS = [prl.Parameters({"ground": order}) for order in (GROUND, GROUND[::-1])]
+EASY = [ranges(named={"easy": {"slope": slope}}) for slope in (1, 2)]
 OTHERS: dict[str, tuple[Any, Any, str]] = {
-    "a parameter more": (
-        ranges(),
-        prl.Parameters({**ONE, "wind": range(9)}, bins=4),
-        "ranges.wind was missing, is 0 to 8, whole",
-    ),
+    "a parameter more": (ranges(), MORE, "ranges.wind was missing, is 0 to 8, whole"),
     "renamed": (ranges(), prl.Parameters({"angle": (0.0, 8.0)}), "ranges.slope was 0 to 8, is mis"),
     "a bit smaller": (ranges(), prl.Parameters({"slope": (0.0, 7.9999999)}), "is 0 to 7.9999999"),
     "fewer items": (ITEMS, prl.Items(10), "count was 100, is 10"),
-    "other features": (ITEMS, prl.Items(100, features=torch.eye(100)), "feat"),
+    "other features": (ITEMS, EYE, "feat"),
     "another target": (prl.Items(9, target=[1]), prl.Items(9, target=[2]), r"was \[1\], is \[2\]"),
     "no target": (ranges(target={"slope": 8}), ranges(), "target.slope was .8.*, is missing"),
-    "another name": (
-        *(ranges(named={"easy": {"slope": slope}}) for slope in (1, 2)),
-        "named.easy.slope was .1",
-    ),
-    "another order": (
-        *(prl.Parameters({"ground": order}) for order in (GROUND, GROUND[::-1])),
-        r"ranges.ground was \['flat', 'stairs', 'gap'\], is \['gap', 'stairs', 'flat'\]",
-    ),
+    "another name": (*EASY, "named.easy.slope was .1"),
+    "another order": (*ORDERS, r"ranges.ground was \['flat', .*\], is \['gap', 'stairs', 'flat'\]"),
     "seeds": (ranges(), ranges(seeded=True), "seeded was False, is True"),
     "a shape": (drawn(3), drawn(4), r"level was torch.float32 \[3\], is torch.float32 \[4\]"),
-    "features": (*(drawn(3, known) for known in (2, 3)), "levels.number of features was 2, is 3$"),
+    "features": (drawn(3, 2), drawn(3, 3), "levels.number of features was 2, is 3$"),
     "a task": (drawn(3), TASK, "kind was LevelGenerator, is "),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("what", OTHERS)
@@ -217,15 +212,11 @@ def test_a_state_of_another_space_is_refused_and_changes_nothing(what: str) -> N
     assert same(kept, own.state_dict())
 
 
-C = prl.curricula
-MODEL: Any = {"labels": "success"}
-
-
 @pytest.mark.parametrize(
     ("before", "now", "message"),
     [
-        (C.plr(), C.domain_randomization(), "kind was plr, is domain_randomization$"),
-        (C.model_transport(), C.model_transport(**MODEL), "model.labels was above_w.*, is success"),
+        ("plr", "domain_randomization", "kind was plr, is domain_randomization$"),
+        ("model_transport", MODEL, "model.labels was above_w.*, is success"),
     ],
 )
 def test_a_state_of_another_setting_is_refused(before: Any, now: Any, message: str) -> None:
@@ -235,7 +226,8 @@ def test_a_state_of_another_setting_is_refused(before: Any, now: Any, message: s
 
 
 def test_a_recipe_and_its_name_have_one_state() -> None:
-    prl.Teacher("plr", SPACE).load_state_dict(prl.Teacher(C.plr(), SPACE).state_dict())
+    state = prl.Teacher(prl.curricula.plr(), SPACE).state_dict()
+    prl.Teacher("plr", SPACE).load_state_dict(state)
 
 
 @pytest.mark.parametrize(
@@ -365,17 +357,10 @@ def test_many_parameters_have_one_bin_each() -> None:
     """8 ** 21 is more than int64 can count."""
     ranges = {f"friction_{i}": (0.0, 1.0) for i in range(21)}
     for bins in ({}, {"bins": {"friction_3": 16}}):
-        with pytest.raises(ValueError, match="combinations of their bins, more than can be num"):
+        with pytest.raises(ValueError, match="combinations of their bins"):
             prl.Parameters(ranges, **bins)  # type: ignore[arg-type]
     _, level = prl.Teacher("plr", prl.Parameters(ranges, bins=1)).ask()
     assert level.keys() == ranges.keys()
-
-
-def test_spaces_take_arrays_and_choices_of_any_kind() -> None:
-    items = prl.Items(3, features=np.eye(3), target=torch.tensor([1, 1, 2]))  # type: ignore[arg-type]
-    torch.testing.assert_close(items.target_shares, torch.tensor([0.0, 2 / 3, 1 / 3]))
-    lists = prl.Parameters({"size": [[1, 2], [3, 4]]}, target={"size": [[3, 4]]})
-    assert lists.target_shares.tolist() == [0, 1]
 
 
 def test_every_update_has_draws_of_its_own() -> None:
@@ -395,6 +380,7 @@ def observe(teacher: prl.Teacher, **outcome: Any) -> None:
 
 
 ZEROS = [0.0] * 4
+NONE = {"return": ZEROS, "success": ZEROS}
 MASKED = np.ma.array([0.0, 1.0], mask=[False, True])
 
 
@@ -408,32 +394,20 @@ def ended(*rewards: float) -> Callable[[prl.Teacher], Any]:
 
 
 REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
-    "a ticket that was never given": (lambda t: t.tell(99, 0.0, 1), "ids=99: is no ticket"),
-    "one that is not out yet": (lambda t: t.tell(6, 0.0, 1), "ids=6: has not been handed out"),
-    "told twice": (lambda t: [t.tell(0, 0.0, 1)] * 2 and t.tell(0, 0.0, 1), "ids=0: has been told"),
-    "twice at once": (lambda t: t.tell([1, 0, 1], [0.0] * 3, [1] * 3), "ids=1: is there more than"),
+    "a ticket that was never given": (lambda t: t.tell(99, 0.0, 1), "ids=99: "),
+    "one that is not out yet": (lambda t: t.tell(6, 0.0, 1), "ids=6: "),
+    "told twice": (lambda t: [t.tell(0, 0.0, 1)] * 2 and t.tell(0, 0.0, 1), "ids=0: "),
+    "twice at once": (lambda t: t.tell([1, 0, 1], [0.0] * 3, [1] * 3), "ids=1: "),
     "not finite, several": (lambda t: t.tell([0, 1], [0.0, NAN], [1, 1]), "return_=nan: must be"),
     "masked among others": (lambda t: t.tell([0, 1], [0.0, np.ma.masked], [1, 1]), "return_=nan"),
     "masked tickets": (lambda t: t.tell(MASKED.astype(int), [0.0, 1.0], [1, 1]), "ids=.*: must be"),
     "no success": (lambda t: t.tell(0, 1.0), "success: missing: this curriculum requires it; tell"),
-    "no episodes": (
-        lambda t: t.tell(0, 1.0, 1, episodes=0),
-        "episodes=0.0: must be a whole number",
-    ),
-    "a state, while tickets are out": (
-        lambda t: t.load_state_dict(t.state_dict()),
-        "state: levels of this teacher are still out",
-    ),
+    "no episodes": (lambda t: t.tell(0, 1.0, 1, episodes=0), "episodes=0.0: must be a whole"),
+    "a state while tickets are out": (lambda t: t.load_state_dict(t.state_dict()), "state: level"),
     "success above 1": (lambda t: t.tell(0, 1.0, 7), "success=7.0: must be from 0 to 1"),
     "too few": (lambda t: t.tell([0, 1], [0.0], [1, 0]), r"return_: has shape \[1\], but"),
-    "observed before it was proposed": (
-        lambda t: t.observe({"return": ZEROS, "success": ZEROS}),
-        "ids: missing: nothing is out",
-    ),
-    "several batches": (
-        lambda t: [t.propose(4), t.propose(4), t.observe({"return": ZEROS, "success": ZEROS})],
-        "ids: missing: 2 batches are out",
-    ),
+    "observed before it was proposed": (lambda t: t.observe(NONE), "ids: missing: nothing is out"),
+    "two batches": (lambda t: [t.propose(4), t.propose(4), t.observe(NONE)], "ids: missing: 2"),
     "no success observed": (lambda t: observe(t, **{"return": ZEROS}), "success: missing"),
     "a rollout of one step": (
         lambda t: observe(t, **{"return": [[0.0] * 3] * 4, "success": ZEROS}),
@@ -448,12 +422,9 @@ REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
     "a rollout's sum": (ended(3e38, 3e38), "return_=inf: must be finite"),
     "a sum of both signs": (ended(math.inf, -math.inf), "return_=nan: must be finite"),
     "no return": (lambda t: t.tell(0, None, 1), "return_=nan: must be finite"),
-    "a result that there is not": (
-        lambda t: observe(t, **{"return": ZEROS, "success": ZEROS, "sucess": ZEROS}),
-        "outcome.sucess: unknown; there are: return, success",
-    ),
+    "a result that there is not": (lambda t: observe(t, **NONE, sucess=ZEROS), "outcome.sucess"),
     "asked for less than none": (lambda t: t.ask(-1), "n=-1: must be a whole number"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("what", REFUSED)
@@ -504,7 +475,7 @@ def test_a_rollout_without_values_is_refused_where_they_are_read(score: str) -> 
     teacher = prl.Teacher(prl.curricula.plr(score=score), SPACE)
     teacher.propose(1)
     teacher.observe(prl.outcome_of(TensorDict({"next": after}, [1, 1])))
-    with pytest.raises(ArgumentError, match=r"^rollout: has no state_value"):
+    with pytest.raises(ArgumentError, match=r"^rollout: .*state_value"):
         teacher.propose(1)
 
 
@@ -527,47 +498,28 @@ def test_a_copy_in_another_process_is_refused() -> None:
         teacher.ask()
 
 
-def recipe(name: str, **settings: Any) -> Any:
-    return getattr(prl.curricula, name)(**settings)
-
-
 NO_TARGET = prl.Parameters({"gravity": (0.0, 1.0)})
-NEEDS = {
-    "sfl": r"student with exact_performance: it has no exact_performance\(levels\)",
-    "robust_plr": r"student with play: it has no play\(levels, generator\)",
-    "accel": "student with play",
-    "currot": "student with performance",
-    "pace": "student with gradient_norms",
-}
-UNFIT: list[tuple[Callable[[], Any], type[Exception], str]] = [
-    *(
-        (lambda name=name: prl.Teacher(recipe(name), SPACE), TypeError, f"{name} needs a {needs}")
-        for name, needs in NEEDS.items()
-    ),
-    *(
-        (
-            lambda n=name: prl.Teacher(recipe(n), SPACE),
-            ArgumentError,
-            "curriculum: needs .* of a task",
-        )
-        for name in ("perf_gain", "task_difficulty", "paired", "first_order_proposer")
-    ),
-    (lambda: prl.Teacher("target", NO_TARGET), ArgumentError, "target: missing"),
-    (lambda: prl.Teacher("plrr", SPACE), ArgumentError, "curriculum='plrr': must be .* accel, "),
-    (lambda: prl.Teacher("target", SPACE, filter="hard"), ArgumentError, "filter='hard': must be"),
-    (lambda: prl.Teacher("target", SPACE, filter={"times": 1}), ArgumentError, "times=1"),
-    (
-        lambda: prl.Teacher(recipe("model_transport", lables="success"), SPACE),
-        ArgumentError,
-        "lables: unknown; there are: .*labels",
-    ),
-]
+UNFIT: list[tuple[Any, Any, dict[str, Any], str]] = [
+    ("sfl", SPACE, {}, r"sfl needs a student with exact_performance: it has no exact_perf"),
+    ("robust_plr", SPACE, {}, r"robust_plr needs a student with play: it has no play\(levels, gen"),
+    ("accel", SPACE, {}, "accel needs a student with play"),
+    ("currot", SPACE, {}, "currot needs a student with performance"),
+    ("pace", SPACE, {}, "pace needs a student with gradient_norms"),
+    ("perf_gain", SPACE, {}, "curriculum: needs .* of a task"),
+    ("task_difficulty", SPACE, {}, "curriculum: needs .* of a task"),
+    ("paired", SPACE, {}, "curriculum: needs .* of a task"),
+    ("first_order_proposer", SPACE, {}, "curriculum: needs .* of a task"),
+    ("target", NO_TARGET, {}, "target: missing"),
+    ("plrr", SPACE, {}, "curriculum='plrr': must be .* accel, "),
+    ("target", SPACE, {"filter": "hard"}, "filter.hard"),
+    ("target", SPACE, {"filter": {"times": 1}}, "times=1"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(("make", "error", "message"), UNFIT)
-def test_what_does_not_fit_is_named(make: Any, error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
-        make()
+@pytest.mark.parametrize(("name", "space", "more", "message"), UNFIT)
+def test_what_does_not_fit_is_named(name: Any, space: Any, more: Any, message: str) -> None:
+    with pytest.raises((ArgumentError, TypeError), match=message):
+        prl.Teacher(name, space, **more)
 
 
 def solved(levels: Any) -> dict[str, Any]:
@@ -581,24 +533,20 @@ def episodes(levels: Any, generator: torch.Generator) -> dict[str, Any]:
     return {"return": success.float(), "success": success}
 
 
+C = prl.curricula
+ALL_SOLVE = {"exact_performance": solved, "optimal_return": lambda levels: torch.ones(len(levels))}
 CAN: dict[str, tuple[Any, dict[str, Any]]] = {
-    "sfl": (prl.curricula.sfl(candidates=64, keep=8), {"exact_performance": solved}),
+    "sfl": (C.sfl(candidates=64, keep=8), {"exact_performance": solved}),
     "sfl from episodes": (
-        prl.curricula.sfl(source="episodes", rollouts=16, candidates=64, keep=8),
+        C.sfl(source="episodes", rollouts=16, candidates=64, keep=8),
         {"play": episodes},
     ),
-    "currot": (prl.curricula.currot(probes=2), {"performance": solved}),
-    "robust_plr": (prl.curricula.robust_plr(score="max_mc", **SMALL), {"play": episodes}),
-    "accel": (prl.curricula.accel(score="regret", **SMALL), {"play": episodes}),
-    "regret": (
-        prl.curricula.regret(**SMALL),
-        {
-            "exact_performance": solved,
-            "optimal_return": lambda levels: torch.ones(len(levels)),
-        },
-    ),
-    "ncc": (prl.curricula.ncc(capacity=16), {"exact_performance": solved}),
-    "learning_progress": (prl.curricula.learning_progress(probes=2), {"performance": solved}),
+    "currot": (C.currot(probes=2), {"performance": solved}),
+    "robust_plr": (C.robust_plr(score="max_mc", **SMALL), {"play": episodes}),
+    "accel": (C.accel(score="regret", **SMALL), {"play": episodes}),
+    "regret": (C.regret(**SMALL), ALL_SOLVE),
+    "ncc": (C.ncc(capacity=16), {"exact_performance": solved}),
+    "learning_progress": (C.learning_progress(probes=2), {"performance": solved}),
 }
 
 

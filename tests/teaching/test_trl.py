@@ -26,20 +26,16 @@ PACKAGES = (
 EXAMPLE = Path(__file__).parents[2] / "examples" / "taught_prompts.py"
 ROWS, ANSWERS = 10, 2
 Settings = dict[str, Any]
+NAMES = ("gradient_accumulation_steps", "per_device_train_batch_size", "steps_per_generation")
+TWICE = {"num_iterations": 2}
 SETTINGS: dict[str, Settings] = {
-    "a generation a step": {"gradient_accumulation_steps": 1, "per_device_train_batch_size": 8},
-    "TRL's defaults": {"gradient_accumulation_steps": 4, "per_device_train_batch_size": 4},
+    "a generation a step": dict(zip(NAMES[:2], (1, 8), strict=True)),
+    "TRL's defaults": dict(zip(NAMES[:2], (4, 4), strict=True)),
     "a generation for four steps": {
-        "gradient_accumulation_steps": 1,
-        "per_device_train_batch_size": 2,
-        "steps_per_generation": 2,
+        **dict(zip(NAMES, (1, 2, 2), strict=True)),
         "num_iterations": 2,
     },
-    "four generations in three steps": {
-        "gradient_accumulation_steps": 4,
-        "per_device_train_batch_size": 2,
-        "steps_per_generation": 3,
-    },
+    "four generations in three steps": dict(zip(NAMES, (4, 2, 3), strict=True)),
 }
 
 

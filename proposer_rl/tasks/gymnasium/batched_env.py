@@ -225,25 +225,13 @@ class ProcessVectorEnv:
     def reset(self, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begins episodes in all environments, or in those of the ``reset_mask``, bool [n]."""
         parts = [(options and {"reset_mask": options["reset_mask"][part]},) for part in self._parts]
-        return tree_map(lambda *each: np.concatenate(each), *self._ask("reset", parts)), {}
+        return _joined(self._ask("reset", parts)), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Takes a step in each environment, with actions [n, ...]."""
         shares = [tree_map(lambda rows, part=part: rows[part], actions) for part in self._parts]
-        answers = self._ask("step", [(share,) for share in shares])
-        seen, *ends, infos = zip(*answers, strict=True)
-        success = [
-            info.get("success", np.zeros(len(part), np.bool_))
-            for info, part in zip(infos, self._parts, strict=True)
-        ]
-        rewards, terminated, truncated, successes = map(np.concatenate, (*ends, success))
-        return (
-            tree_map(lambda *each: np.concatenate(each), *seen),
-            rewards,
-            terminated,
-            truncated,
-            {"success": successes},
-        )
+        answer: Any = _joined(self._ask("step", [(share,) for share in shares]))
+        return answer
 
     def set_attr(self, name: str, values: Sequence[Any]) -> None:
         """Sets an attribute of each environment to a value of its own."""
@@ -276,12 +264,17 @@ class ProcessVectorEnv:
             codes = [process.exitcode for process in self.processes if process.exitcode]
             raise LostProcessError(
                 f"vectorization=async: a process of the environments was lost (exit code {codes}; "
-                "-9: killed, mostly for want of memory)"
+                "-9 mostly means that memory ran out)"
             ) from error
         for failed, answer in answers:
             if failed:
                 raise answer
         return [answer for _, answer in answers]
+
+
+def _joined(answers: list[Any]) -> Any:
+    """Returns the arrays in the answers of all processes, joined in their places."""
+    return tree_map(lambda *each: np.concatenate(each), *answers)
 
 
 def _player(registered: gymnasium.envs.registration.EnvSpec | None, *given: Any) -> LevelPlayer:
@@ -325,6 +318,9 @@ def _serve(pipe: Connection) -> None:
                     if given[0] is None or given[0]["reset_mask"].any():
                         seen = env.reset(options=given[0])[0]
                     answer = seen
+                elif what == "step":
+                    *answer, info = env.step(*given)
+                    answer.append({"success": info.get("success", np.zeros_like(answer[-1]))})
                 else:
                     answer = getattr(env, what)(*given)
                 failed = False

@@ -5,11 +5,9 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from numbers import Number
 from typing import Any, Literal
 
-import gymnasium
 import numpy as np
 import torch
 
@@ -77,33 +75,18 @@ def write_attribute(environment: Any, path: str, value: Any) -> None:
 
 
 def mismatch(environment: Any, path: str, value: Any) -> str | None:
-    """Describes in a line how the value at a path differs from this one; None where it does not.
-
-    A wrapper that has an attribute of this name must have the same value.
-    """
-    for layer, now in _readings(environment, path):
-        try:
-            if is_real(value):
-                # It may be kept in 32 bits.
-                same = math.isclose(float(now), float(value), rel_tol=1e-5, abs_tol=1e-8)
-            else:
-                same = now is value or np.array_equal(now, value)
-        except (TypeError, ValueError, RuntimeError):
-            same = False
-        if not same:
-            return f"{path} of {type(layer).__name__} is {now}, not {value_text(value)}"
-    return None
-
-
-def _readings(environment: Any, path: str) -> Iterator[tuple[Any, Any]]:
-    """Yields the values at a path in an environment, and in those wrappers that have it."""
-    first = path.partition(".")[0]
-    while isinstance(environment, gymnasium.Wrapper):
-        if hasattr(environment, first):
-            with suppress(UnfitEnvironmentError):
-                yield environment, read_attribute(environment, path)
-        environment = environment.env
-    yield environment, read_attribute(environment, path)
+    """Describes in a line how the value at a path differs from this one; None where it does not."""
+    inner = environment.unwrapped
+    now = read_attribute(inner, path)
+    try:
+        if is_real(value):
+            # It may be kept in 32 bits.
+            same = math.isclose(float(now), float(value), rel_tol=1e-5, abs_tol=1e-8)
+        else:
+            same = now is value or np.array_equal(now, value)
+    except (TypeError, ValueError, RuntimeError):
+        same = False
+    return None if same else f"{path} of {type(inner).__name__} is {now}, not {value_text(value)}"
 
 
 def _in_place_of(before: Any, value: Any, path: str) -> Any:

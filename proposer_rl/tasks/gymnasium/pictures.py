@@ -22,6 +22,7 @@ from proposer_rl.tasks.gymnasium.player import (
     MakeEnvironment,
     ParameterSettings,
 )
+from proposer_rl.tasks.gymnasium.spaces import Layout
 from proposer_rl.tasks.parameters import SEED
 
 # Most environments draw with pygame: no greeting, no window and no sound.
@@ -73,7 +74,10 @@ class Camera:
         self._player.reset()
         frames = [self._frame()]
         steps = 0 if actions is None else len(actions)
-        taken = None if actions is None else self._player.layout.taken(actions)
+        taken = None
+        if actions is not None:
+            spaces = self._player.observation_space, self._player.action_space
+            taken = Layout(*spaces).taken(actions)
         moments = {round(part * steps / LATER) for part in range(1, LATER + 1)}
         for number in range(steps):
             self._player.step(tree_map(lambda rows, number=number: rows[number], taken))

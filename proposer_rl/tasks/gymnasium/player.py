@@ -6,7 +6,6 @@ import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Annotated, Any, Literal, NamedTuple
@@ -23,7 +22,7 @@ from proposer_rl.tasks.gymnasium.environment import (
     read_step,
     write_attribute,
 )
-from proposer_rl.tasks.gymnasium.spaces import Layout, cast_to
+from proposer_rl.tasks.gymnasium.spaces import cast_to
 from proposer_rl.tasks.parameters import MOST_BINS, SEED
 from proposer_rl.tasks.ranges import RangeSettings, value_text
 
@@ -44,7 +43,7 @@ class ParameterSettings(RangeSettings):
             argument, option or function, or several names that all get the value; None for the
             parameter's own name.
         to: what the environment gets in place of each of ``values``, which are then numbers that
-            only order the choices.
+            say how the choices are ordered and how far apart they are.
     """
 
     values: Annotated[list[Any], Len(1, MOST_BINS)] | None = None
@@ -160,11 +159,6 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
     @play.setter
     def play(self, play: GymLevel) -> None:
         self._play, self._played, self._still = play, False, False
-
-    @cached_property
-    def layout(self) -> Layout:
-        """Returns the conversion between the environment's spaces and a Solver's tensors."""
-        return Layout(self.observation_space, self.action_space)
 
     @property
     def in_time(self) -> bool:

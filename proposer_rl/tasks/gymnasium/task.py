@@ -184,8 +184,7 @@ class GymnasiumTask(Task):
         evaluation = self._evaluation
         return {
             "Environment": f"{self.title}, at most {self.max_steps} steps",
-            "Target": "; ".join(f"{name} {bins}" for name, bins in self.target.bins.items())
-            or "any level",
+            "Target": str(self.target),
             "Measured on": f"{evaluation.levels} fixed levels of the target, and as many of "
             f"all bins; {evaluation.episodes} episode(s) on each, with "
             f"{evaluation.actions.replace('_', ' ')} actions",
@@ -231,15 +230,11 @@ class GymnasiumTask(Task):
         self, levels: TensorDictBase, rollout: TensorDictBase | None
     ) -> list[NDArray[np.uint8]]:
         """Draws frames of levels [n], and of the Solver's first episode there [n, T]."""
-        if rollout is None:
-            return [self._camera.picture(play, None) for play in self._plays(levels)]
-        first = in_first_episode(rollout)
-        return [
-            self._camera.picture(play, actions[steps])
-            for play, actions, steps in zip(
-                self._plays(levels), rollout["action"], first, strict=True
-            )
-        ]
+        taken: list[Any] = [None] * len(levels)
+        if rollout is not None:
+            pairs = zip(rollout["action"], in_first_episode(rollout), strict=True)
+            taken = [actions[steps] for actions, steps in pairs]
+        return list(map(self._camera.picture, self._plays(levels), taken))
 
     def own_spaces(self) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any]]:
         """Returns the spaces of observations and actions of one environment with its wrappers.
@@ -249,8 +244,8 @@ class GymnasiumTask(Task):
         """
         if self._unpaid():
             raise ValueError(
-                "transforms: these are not applied to observations of a plain environment; put "
-                "run.solver().actor() into a TransformedEnv with them"
+                "transforms: a plain environment does not apply these; use run.solver().actor() "
+                "in a TransformedEnv with them"
             )
         env = LevelPlayer(self._make, self._parameters, self._first)
         env.close()

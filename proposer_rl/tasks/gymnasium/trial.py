@@ -48,11 +48,12 @@ def check_environment(
         ImportError, gymnasium.error.Error: from the environment, if it cannot be made.
     """
     _check_interface(LevelPlayer(make, parameters, target))
-    _check_wrappers(make, parameters, target)
+    if make.wrappers:
+        _check_wrappers(make, parameters, target)
     player = LevelPlayer(make, parameters, target, success)
     limit = min((one._max_episode_steps for one in time_limits(player)), default=None)
     if limit is None:
-        raise ValueError("max_steps: missing: the environment has no time limit of its own")
+        raise ValueError("max_steps: missing, and the environment has no time limit of its own")
     _check_episode(player, success, limit)
     for name, part in bins.items():
         each = isinstance(part, Labelled) or parameters[name].to is not None
@@ -88,16 +89,15 @@ def _check_wrappers(
     Raises:
         ValueError: naming the wrapper from which on they have not.
     """
-    for count in range(len(make.wrappers) + 1 if make.wrappers else 0):
+    for count in range(len(make.wrappers) + 1):
         player = LevelPlayer(replace(make, wrappers=make.wrappers[:count]), parameters, play)
         first, second = (list(_played(player, SHORT)) for _ in range(2))
         player.close()
         keeps = hasattr(player.env, "update_running_mean")  # also of rewards that are all zero yet
-        if keeps or not _same_episodes(first, second):
-            break
-    else:
-        return
-    if count:
+        if _same_episodes(first, second) and not keeps:
+            continue
+        if count == 0:  # the environment itself differs, of which check_env warns
+            return
         raise ValueError(
             f"wrappers: {make.wrappers[count - 1]}: with it the same actions on the same level can "
             "have other results the second time: it keeps running statistics, or draws numbers "

@@ -59,10 +59,10 @@ class SingleMaze(gymnasium.Env[Any, Any]):
         if "frameskip" in maze:  # TorchRL's GymEnv tries it, and expects this error
             raise TypeError("SingleMaze got an unexpected keyword argument 'frameskip'")
         rules = MazeSettings(**maze)
-        fractions, lengths = (
-            value if isinstance(value, list) else [value]
-            for value in (obstacle_fraction, path_length)
+        fractions = (
+            obstacle_fraction if isinstance(obstacle_fraction, list) else [obstacle_fraction]
         )
+        lengths = path_length if isinstance(path_length, list) else [path_length]
         if max(lengths) > rules.max_steps:
             raise ArgumentError(
                 f"max_steps={rules.max_steps}: must be at least the path length {max(lengths)}, "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar
@@ -169,20 +169,9 @@ class GridTask(Task):
 
     @abstractmethod
     def results_on(
-        self,
-        agent: ActorCritic,
-        levels: Any,
-        about: Mapping[str, Mapping[str, int]],
-        max_steps: int,
-    ) -> Iterator[LevelResult]:
-        """Yields the results of K Solvers on levels [n] of one size.
-
-        Args:
-            agent: K Solvers.
-            levels: [n].
-            about: facts about each level, by its name.
-            max_steps: step limit of an episode.
-        """
+        self, agent: ActorCritic, levels: Any, names: Sequence[str], max_steps: int
+    ) -> Mapping[str, Tensor]:
+        """Returns the results of K Solvers on levels [n] of one size, by name, each [K, n]."""
 
     @abstractmethod
     def at_once(self, cells: int) -> int:
@@ -243,9 +232,13 @@ class GridTask(Task):
         for (limit, height, width), members in batches.items():
             together = max(self.at_once(height * width), 1)
             for first in range(0, len(members), together):
-                described = {known: about[known] for known in members[first : first + together]}
-                batch: Any = torch.stack([levels[known] for known in described])
-                results += self.results_on(agent, batch.to(self.device), described, limit)
+                names = members[first : first + together]
+                batch: Any = torch.stack([levels[name] for name in names])
+                found = self.results_on(agent, batch.to(self.device), names, limit)
+                for i, name in enumerate(names):
+                    for k in range(agent.copies):
+                        numbers = {key: float(values[k, i]) for key, values in found.items()}
+                        results.append(LevelResult(name, k, about[name], numbers))
         place = {known: number for number, known in enumerate(levels)}
         return sorted(results, key=lambda result: (place[result.level], result.solver))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import torch
@@ -21,7 +21,7 @@ from proposer_rl.models import (
     map_actor_critic,
 )
 from proposer_rl.settings import settings
-from proposer_rl.task import CellKind, ComputeContext, LevelResult, for_copies
+from proposer_rl.task import CellKind, ComputeContext, for_copies
 from proposer_rl.tasks.mazes.drawings import EPISODE
 from proposer_rl.tasks.mazes.evaluation import (
     ExactEvaluator,
@@ -308,23 +308,14 @@ class MazeTask(GridTask):
 
     @torch.no_grad()
     def results_on(
-        self,
-        agent: ActorCritic,
-        levels: Level,
-        about: Mapping[str, Mapping[str, int]],
-        max_steps: int,
-    ) -> Iterator[LevelResult]:
-        """Yields the exact results of K Solvers on levels [n] of one size.
+        self, agent: ActorCritic, levels: Level, names: Sequence[str], max_steps: int
+    ) -> Mapping[str, Tensor]:
+        """Returns the exact results of K Solvers on levels [n] of one size, each [K, n].
 
         They are ``success`` and ``return`` of the sampled policy, and ``greedy_success`` (1 or 0)
         and ``greedy_return`` of the most probable actions.
         """
-        copies, logits = _with_logits(agent, levels)
-        performance = self._exactly(copies, logits, max_steps)
-        for k in range(len(copies)):
-            for i, (name, known) in enumerate(about.items()):
-                results = {key: float(value[k, i]) for key, value in performance.items()}
-                yield LevelResult(name, k, known, results)
+        return self._exactly(*_with_logits(agent, levels), max_steps)
 
 
 class MazeBoard(Drawings):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any
 
@@ -16,7 +16,7 @@ from proposer_rl.learning import SolverSettings, mean_performance
 from proposer_rl.models import ActorCritic, MemoryNetwork
 from proposer_rl.settings import settings
 from proposer_rl.streams import Streams
-from proposer_rl.task import CellKind, ComputeContext, LevelResult, for_copies
+from proposer_rl.task import CellKind, ComputeContext, for_copies
 from proposer_rl.tasks.mazes.grid_task import Drawings, GridTask
 from proposer_rl.tasks.mazes.levels import (
     FREE,
@@ -166,39 +166,30 @@ class ViewMazeTask(GridTask):
         return EPISODES_AT_ONCE // self._named_episodes
 
     def results_on(
-        self,
-        agent: ActorCritic,
-        levels: ViewLevel,
-        about: Mapping[str, Mapping[str, int]],
-        max_steps: int,
-    ) -> Iterator[LevelResult]:
-        """Yields the results of K Solvers in episodes on levels [n] of one size.
+        self, agent: ActorCritic, levels: ViewLevel, names: Sequence[str], max_steps: int
+    ) -> Mapping[str, Tensor]:
+        """Returns the results of K Solvers in episodes on levels [n] of one size, each [K, n].
 
         They are ``success``, the share of episodes that reach the goal, the bounds of its 95 %
         interval (Wilson 1927), ``success_low`` and ``success_high``, and ``return``, the mean.
         """
-        episodes, generator = self._named_episodes, self._draws.generator(next(iter(about)))
-        copies = for_copies(agent, levels)
+        episodes, generator = self._named_episodes, self._draws.generator(names[0])
         performance = mean_performance(
             agent,
             partial(ViewMazeEnv, max_steps=max_steps),
-            copies,
+            for_copies(agent, levels),
             generator,
             max_steps=max_steps,
             episodes=episodes,
             drop_finished=self.drop_finished,
         ).cpu()
-        for i, (name, known) in enumerate(about.items()):
-            for k in range(len(copies)):
-                reached = round(float(performance["success"][k, i]) * episodes)
-                interval = scipy.stats.binomtest(reached, episodes).proportion_ci(method="wilson")
-                results = {
-                    "success": reached / episodes,
-                    "success_low": float(interval.low),
-                    "success_high": float(interval.high),
-                    "return": float(performance["return"][k, i]),
-                }
-                yield LevelResult(name, k, known, results)
+        reached = (performance["success"].double() * episodes).round()
+        counts = reached.flatten().int().tolist()
+        tests = [scipy.stats.binomtest(count, episodes) for count in counts]
+        bounds = [test.proportion_ci(method="wilson") for test in tests]
+        low, high = torch.tensor(bounds, dtype=torch.float64).T.unflatten(1, reached.shape)
+        success = {"success": reached / episodes, "success_low": low, "success_high": high}
+        return {**success, "return": performance["return"]}
 
 
 class ViewBoard(Drawings):

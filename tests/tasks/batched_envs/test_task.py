@@ -70,8 +70,6 @@ def test_its_title_target_and_levels_are_told() -> None:
     [
         ("task.env=nowhere.at.All", "env: 'nowhere.at.All' cannot be imported"),
         ("task.env=torch.nn.Linear", "task.env='torch.nn.Linear': must be a subclass of Batched"),
-        ("task.max_steps=0", "task.max_steps=0: "),
-        ("task.parameters.wind.low=3", "task.parameters.wind: low=3"),
     ],
 )
 def test_what_is_no_environment_is_refused(

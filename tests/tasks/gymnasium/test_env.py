@@ -119,7 +119,9 @@ def test_a_process_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) 
     env.rollout(1)
     env._vector._pipes[0].send(("step", ([0],)))
     env.close()
-    assert env._vector.processes[0].exitcode == -signal.SIGKILL
+    (process,) = env._vector.processes
+    process.join(60)
+    assert process.exitcode == -signal.SIGKILL
 
 
 def test_a_process_that_waits_for_its_answer_to_be_read_ends() -> None:
@@ -220,16 +222,10 @@ def test_a_return_is_reached_up_to_rounding(reward: Any) -> None:
     assert not rule(True, False, True, rule.least - 1e-4, {})  # type: ignore[operator]
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"kind": "return"}, "least: missing"),
-        ({"kind": "info"}, "key: missing"),
-    ],
-)
-def test_success_has_what_its_kind_needs(settings: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        SuccessSettings(**settings)
+@pytest.mark.parametrize(("kind", "needed"), [("return", "least"), ("info", "key")])
+def test_success_has_what_its_kind_needs(kind: Any, needed: str) -> None:
+    with pytest.raises(ValueError, match=f"{needed}: missing"):
+        SuccessSettings(kind=kind)
 
 
 RULES = [

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from proposer_rl.tasks.gymnasium.batched_env import plays
-from proposer_rl.tasks.gymnasium.environment import UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.player import (
     GymLevel,
     LevelPlayer,
@@ -191,27 +190,6 @@ def test_a_longer_pole_obeys_the_equations_of_motion() -> None:
     moving = push - mass * length * turning * math.cos(angle) / total
     assert seen[1] == pytest.approx(speed + 0.02 * moving, abs=1e-5)
     assert seen[3] == pytest.approx(turn + 0.02 * turning, abs=1e-5)
-
-
-REFUSED = [
-    (numbers("lenght"), 1,
-     "parameters.lenght: Walk has no attribute 'lenght'; numbers that it has: width, wind"),
-    ({"width": argument()}, -1,
-     "constructor raises ValueError: width .*, on the level width=-1, seed=0"),
-    ({"wdth": argument()}, 1, "constructor raises TypeError: .*'wdth'.* level wdth=1"),
-    ({"a": ParameterSettings(set="call", name="math.sqrt", values=[1], target=1)}, 1,
-     r"parameters.a: TypeError: .* \(player.py, line"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("parameters", "value", "message"), REFUSED)
-def test_what_the_environment_refuses_is_told(parameters: Any, value: int, message: str) -> None:
-    with pytest.raises(UnfitEnvironmentError, match=message):
-        player = LevelPlayer(
-            MakeEnvironment(WALK), parameters, GymLevel(dict.fromkeys(parameters, value), 0)
-        )
-        player.reset()
-        player.reset()
 
 
 @NO_BOX2D

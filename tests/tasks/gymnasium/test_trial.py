@@ -78,18 +78,14 @@ MISREAD: list[tuple[dict[str, Any], str]] = [
     ({"reset": lambda self, **o: Line.reset(self, **o)[0]}, "env_id=Odd.*float32 .*space is Box"),
     ({"step": lambda self, a: (*Line.step(self, a)[:3], {})}, "env_id=Odd.*step raises ValueError"),
     (steps(None), "the reward must be a number, not None"),
-    (steps(np.zeros(2)), "the reward must be a number, not array"),
     ({"step": lambda self, a: 1 / 0}, r"env_id=Odd.*step raises ZeroDivisionError: .*"
      r"\(test_trial.py, line \d+\), on the level goal=3, seed=\d+"),
-    (shows({"b": 1}, spaces.Dict({"a": spaces.Discrete(3)})),
-     "reset raises KeyError: 'a' .*on the level goal=3"),
     (shows({"a": "abc"}, spaces.Dict({"a": spaces.Text(3)})),
      "no network for Text.*its part a; .*FilterObservation"),
     ({"action_space": spaces.Tuple(PAIR)}, "action space Tuple.*there is a policy for"),
     (steps(info={"is_success": "False"}), "success.key=is_success.*not 'False'"),
     (steps(info={"is_success": 0.3}), "success.key=is_success.*not 0.3"),
     (steps(info={"is_sucess": True, "a": {"b": 1}}), "it has: is_sucess, a, a.b; "),
-    ({"metadata": None}, "env_id=Odd"),
     ({"goal": property(lambda self: 3.0)}, "parameters.goal: AttributeError: property 'goal'"),
     ({"reset": lambda self, **o: (sets_back(self), Line.reset(self, **o))[1]},
      "parameters.goal: goal of Odd is 2.0, not 1, after a reset and a step"),
@@ -186,10 +182,7 @@ def test_a_number_gets_to_where_its_path_leads(path: str) -> None:
 @pytest.mark.parametrize(
     ("path", "message"),
     [
-        (
-            "gravity",
-            r"is array\(.*, no place for 0.5; name one of its parts, as in name: gravity.0",
-        ),
+        ("gravity", r"is array\(.*, no place for 0.5; .*, as in name: gravity.0"),
         ("sizes", r"is \[1.0, 2.0\], no place for 0.5; name one of its parts"),
         ("gravity.3", "has no attribute 'gravity.3'"),
         ("config.wind.force", "has no attribute 'config.wind.force'; numbers that it has"),
@@ -213,21 +206,16 @@ def test_what_is_only_passed_on_is_not_set_beside_it() -> None:
     assert environment.drag == 0.5
 
 
+KEEPS = "with it the same actions .* keeps running stat"
+
+
 @pytest.mark.parametrize(
-    ("wrapper", "message"),
-    [
-        (
-            "gymnasium.wrappers.NormalizeObservation",
-            "with it the same actions .* keeps running stat",
-        ),
-        (
-            "gymnasium.wrappers.NormalizeReward",
-            "with it the same actions .* keeps running stat",
-        ),
-        ("gymnasium.wrappers.FilterObservation", "TypeError: .*filter_keys"),
-    ],
-)
-def test_a_wrapper_that_spoils_it_is_blamed(wrapper: str, message: str) -> None:
+    ("name", "message"),
+    [("NormalizeObservation", KEEPS), ("NormalizeReward", KEEPS),
+     ("FilterObservation", "TypeError: .*filter_keys")],
+)  # fmt: skip
+def test_a_wrapper_that_spoils_it_is_blamed(name: str, message: str) -> None:
+    wrapper = f"gymnasium.wrappers.{name}"
     with pytest.raises(ValueError, match=f"wrappers: {wrapper}: {message}"):
         line_task(odd(), wrappers=["gymnasium.wrappers.RecordEpisodeStatistics", wrapper])
 
@@ -319,15 +307,11 @@ CHOICE, CHOICES, BITS = spaces.Discrete(5), spaces.MultiDiscrete([5, 5]), spaces
 BOXED = spaces.Dict({"a": spaces.Box(-1, 1, (2,)), "b": CHOICE})
 LATER: list[tuple[Any, Any, Any]] = [
     (BYTES, np.array([1, 2]), np.array([1, 256])),
-    (BYTES, np.array([1, 2]), np.array([0.3, 0.7])),
     (Line.observation_space, np.ones(2), np.ones(3)),
-    (Line.observation_space, np.ones(2), None),
     (Line.observation_space, np.ones(2), ["a", "b"]),
-    (CHOICE, 1, -1),
     (CHOICE, 1, 5),
     (CHOICES, np.array([1, 2]), np.array([1, -2])),
     (BITS, np.array([0, 1]), np.array([0, 2])),
-    (BITS, np.array([0, 1]), np.array([0, 256])),
     (BOXED, {"a": np.ones(2), "b": 1}, {"a": np.ones(3), "b": 1}),
 ]
 
@@ -345,19 +329,6 @@ def test_what_a_space_cannot_hold_is_also_refused_after_the_trial(
     for act in (player.reset, lambda: player.step(0)):
         with pytest.raises(UnfitEnvironmentError, match=message):
             act()
-
-
-@pytest.mark.parametrize("info", [{}, {"is_success": None}])
-def test_an_end_that_does_not_tell_success_is_refused_after_the_trial_too(info: Any) -> None:
-    tells = {"is_success": False}
-    ends = odd(step=lambda self, a: (self.seen(), 0.0, True, False, self.told), told=tells)
-    player = LevelPlayer(MakeEnvironment(ends), GOAL, GymLevel({"goal": 3.0}, 0), TOLD)
-    player.reset()
-    player.step(0)
-    player.unwrapped.told = info  # type: ignore[attr-defined]
-    player.reset()
-    with pytest.raises(UnfitEnvironmentError, match=r"success.key=is_success: .* level goal=3"):
-        player.step(0)
 
 
 @pytest.mark.parametrize("vectorization", ["sync", "async"])
@@ -386,31 +357,6 @@ def test_what_fails_after_the_trial_names_the_level(vectorization: Any) -> None:
         with pytest.raises(UnfitEnvironmentError, match=f"{said}.* level goal={goal:g}, seed=7$"):
             env.rollout(5 * LIMIT, break_when_any_done=False)
         env.close()
-
-
-def that_fits_the_ends(env: Any) -> Any:
-    if env.unwrapped.goal not in (1.0, 3.0):  # which the trial plays
-        raise RuntimeError("it fits\nno other")
-    return env
-
-
-@pytest.mark.parametrize("vectorization", ["sync", "async"])
-def test_a_wrapper_that_fails_after_the_trial_is_blamed(vectorization: Any) -> None:
-    """Also where it fails in a process of its own, whose error has to be sent."""
-
-    def built(self: Any, goal: float = 3.0, render_mode: str | None = None) -> None:
-        self.goal = goal
-
-    goal = {"goal": ParameterSettings(set="argument", low=1.0, high=3.0, target=3.0)}
-    task = line_task(
-        odd(__init__=built), parameters=goal, vectorization=vectorization,
-        wrappers=["tests.tasks.gymnasium.test_trial.that_fits_the_ends"],
-    )  # fmt: skip
-    level = TensorDict({"goal": torch.tensor([[2.0]]), "seed": torch.tensor([[7]])}, [1, 1])
-    with pytest.raises(
-        UnfitEnvironmentError, match=r"wrappers: .*that_fits_the_ends: RuntimeError: it fits"
-    ):
-        task.environment(level)
 
 
 @pytest.mark.filterwarnings("ignore")

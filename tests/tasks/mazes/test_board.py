@@ -125,18 +125,9 @@ def test_a_goal_that_cannot_be_reached_is_told() -> None:
     assert told["results"]["success"] == 0 and told["results"]["steps"] == pytest.approx(8)
 
 
-@pytest.mark.parametrize(
-    ("rows", "message"),
-    [
-        (["S.", "G"], "a level is a rectangle"),
-        (["S..", "..."], "with one 'S' and one 'G'"),
-        (["S...G"], "level 'drawn': 1x5 cells are too few"),
-    ],
-)
-def test_drawings_that_are_no_levels_are_refused(rows: list[str], message: str) -> None:
-    with pytest.raises(ValueError, match=message) as refused:
-        tiny_task().board.read(rows)
-    assert "\n" not in str(refused.value)
+def test_drawings_that_solvers_cannot_see_are_refused() -> None:
+    with pytest.raises(ValueError, match="level 'drawn': 1x5 cells are too few"):
+        tiny_task().board.read(["S...G"])
 
 
 def test_drawings_go_round(tmp_path: Path) -> None:

@@ -54,14 +54,6 @@ def test_agent_is_observed_on_demand_only() -> None:
     assert shown["planes"][3].nonzero().tolist() == [[0, 1]]
 
 
-def test_goal_at_the_step_limit_terminates_and_does_not_truncate() -> None:
-    env = MazeEnv(ROOM, max_steps=3)
-    state = env.reset()
-    for action in (DOWN, RIGHT, RIGHT):
-        state = step(env, state, action)
-    assert state["terminated"] and state["done"] and not state["truncated"]
-
-
 @settings(max_examples=40)
 @given(
     size=st.tuples(st.integers(1, 5), st.integers(2, 5)),
@@ -111,17 +103,6 @@ def test_unfinished_episodes_end_on_the_levels_they_began_on() -> None:
     _, state = env.step_and_maybe_reset(state.set("action", torch.tensor([RIGHT, RIGHT])))
     assert state["agent"].tolist() == [[0, 2], [0, 2]]
     assert env.levels.to_text() == ["G.S", ".GS"]
-
-
-@pytest.mark.parametrize(
-    "levels",
-    [random_levels(2, 4, 4, 0.2, 0), random_levels(3, 4, 5, 0.2, 0)],
-    ids=["batch", "grid"],
-)
-def test_levels_of_another_shape_are_refused(levels: Level) -> None:
-    env = MazeEnv(random_levels(3, 4, 4, 0.2, 0))
-    with pytest.raises(RuntimeError):  # torch's own
-        env.set_levels(levels)
 
 
 def test_what_is_stepped_decides_where_the_agent_is() -> None:

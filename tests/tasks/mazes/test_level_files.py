@@ -83,20 +83,17 @@ def test_round_trips(levels: dict[str, Level]) -> None:
         ("bad.txt", "[a]\nS.G\n[a]\nS.G", "level 'a': the name occurs twice"),
         ("bad.txt", "[a]\nS.G\n..", "level 'a': a level is a rectangle"),
         ("bad.txt", "[a]\npath_length: 3\nS.G", "is 3, but the shortest path has 2 moves"),
-        ("bad.txt", b"\xff\xfe", "'utf-8' codec"),
-        ("bad.json", "{", "Invalid JSON"),
         ("bad.json", '{"levels": []}', "holds no levels"),
         ("bad.json", '{"levels": [{"name": "a"}]}', "levels.0.level: Field required"),
-        ("bad.jsonl", "", "holds no levels"),
         ("bad.jsonl", '{"seed": 0, "levels": []}\n', "0.updates: Field required"),
         ("bad.jsonl", '{"seed": 0, "updates": 1, "levels": [{"text": ["S x"]}]}\n', "rectangle"),
     ],
 )
 def test_what_holds_no_levels_is_refused(
-    name: str, content: str | bytes, message: str, tmp_path: Path
+    name: str, content: str, message: str, tmp_path: Path
 ) -> None:
     file = tmp_path / name
-    file.write_bytes(content if isinstance(content, bytes) else content.encode())
+    file.write_text(content)
     with pytest.raises(ValueError) as caught:
         read_levels(file)
     assert str(caught.value).startswith(f"{file}: ") and message in str(caught.value)

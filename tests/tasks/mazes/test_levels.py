@@ -5,8 +5,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from proposer_rl.tasks.mazes import Level, planes, validate_levels
-from tests.tasks.mazes.oracles import random_levels
+from proposer_rl.tasks.mazes import Level, planes, shortest_path_length, validate_levels
+from proposer_rl.tasks.mazes.levels import cells_at_depth, cells_first
+from tests.tasks.mazes.oracles import distances, path_length, random_levels
 
 DRAWING = """
     S.#
@@ -58,11 +59,6 @@ def test_planes_show_obstacles_start_and_goal() -> None:
         )
 
 
-def test_valid_levels_pass() -> None:
-    validate_levels(random_levels(5, 3, 3, 0.5, 0))
-    validate_levels(Level.from_text(DRAWING))
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -81,3 +77,36 @@ def test_invalid_levels_are_refused(change: dict[str, torch.Tensor], message: st
     fields = {name: change.get(name, getattr(level, name)) for name in ("walls", "start", "goal")}
     with pytest.raises(ValueError, match=message):
         validate_levels(Level(**fields, batch_size=[2]))
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "fraction"),
+    [(10, 10, 0.4), (10, 10, 0.1), (5, 8, 0.3), (1, 9, 0.1), (9, 1, 0.1), (2, 2, 0.4)],
+)
+def test_distances_agree_with_networkx(height: int, width: int, fraction: float) -> None:
+    levels = random_levels(400, height, width, fraction, seed=height * width)
+    lengths = shortest_path_length(levels).tolist()
+    assert -1 in lengths and max(lengths) > 1
+    for level, length in zip(levels, lengths, strict=True):
+        assert length == path_length(level)
+
+
+@pytest.mark.parametrize("depth", [1, 2, 5, 8])
+def test_cells_at_a_depth_agree_with_networkx(depth: int) -> None:
+    levels = random_levels(50, 8, 7, 0.3, seed=1)
+    source = levels.start[:, 0] * 7 + levels.start[:, 1]
+    found = cells_at_depth(cells_first(~levels.walls), source, torch.full((50,), depth))
+    assert found.any()
+    for level, cells in zip(levels, found.unbind(-1), strict=True):
+        expected = [cell for cell, distance in distances(level).items() if distance == depth]
+        assert sorted(map(tuple, cells.nonzero().tolist())) == sorted(expected)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (2, 3), (0,)])
+def test_any_batch_shape(shape: tuple[int, ...]) -> None:
+    levels = random_levels(6, 4, 4, 0.2, seed=2)
+    count = torch.Size(shape).numel()
+    batch = levels[:count].reshape(shape)
+    lengths = shortest_path_length(batch)
+    assert (lengths.shape, lengths.dtype) == (shape, torch.int64)
+    assert lengths.flatten().tolist() == [path_length(level) for level in levels[:count]]

@@ -117,24 +117,6 @@ def test_a_mass_passes_the_gate_and_nothing_else(level: Level, forces: list, hit
         assert (x_speed, y, y_speed) == (0.0, 0.0, 0.0)
 
 
-def test_it_hits_the_wall_from_behind_as_well() -> None:
-    """Through a gate at the side, then back up in the middle."""
-    env = PointMassEnv(gates((3.0, 1.0, 0.0)))
-    state = env.reset()
-    state["observation"][0, :4] = torch.tensor([3.0, -9.0, -0.5, 0.0])
-    ends = []
-    for _ in range(8):
-        state = env.step(state.set("action", torch.tensor([UP])))["next"]
-        ends.append(bool(state["terminated"]))
-        state = state.exclude("reward")
-    assert sum(ends) >= 1 and not ends[0]
-
-
-def test_the_border_stops_a_mass() -> None:
-    *_, last = fly((0.0, 0.5, 0.0), RIGHT, steps=20)
-    assert float(last["observation"][0]) == 4.0
-
-
 def test_success_is_to_be_at_the_goal_in_the_end() -> None:
     """A controller flies there and stays; one that only flies by has not succeeded."""
     env = PointMassEnv(gates((0.0, 1.0, 0.0)), max_steps=60)

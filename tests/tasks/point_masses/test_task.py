@@ -72,22 +72,3 @@ def test_runs_resume_with_the_same_bytes(method: list[str], train: Any) -> None:
         assert train(*words, "schedule.checkpoint_every=2") == 0
     assert read_csv(whole / "metrics.csv")[-1]["updates"] == 4
     assert_same_run(whole, parts)
-
-
-@pytest.mark.usefixtures("own_folder")
-@pytest.mark.parametrize(
-    ("word", "said"),
-    [
-        ("+task.parameters.mass={values: [1], target: 1}", "task.parameters.mass: unknown"),
-        (
-            "task.parameters.position.target.distribution=gauss",
-            "'gauss': input should be 'norm'",
-        ),
-    ],
-)
-def test_what_no_mass_can_be_before_is_refused(
-    word: str, said: str, train: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert train(*TINY, "+method=target", word, "hydra.run.dir=run") == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert said in line and not Path("run", "run.json").exists()

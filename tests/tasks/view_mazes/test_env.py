@@ -10,8 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
-from proposer_rl.tasks.view_mazes.view_env import AGENT_PLACE, GOAL_OBJECT, ViewMazeEnv
-from proposer_rl.tasks.view_mazes.view_levels import ViewLevel
+from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv
 from research.benchmarks.minigrid_env import MiniGridMaze
 from tests.tasks.view_mazes.oracles import random_levels
 
@@ -88,23 +87,3 @@ def test_new_levels_are_played_from_the_next_reset_on() -> None:
     for key in ("view", "direction", "agent"):
         assert torch.equal(state[key], begun[key])
     assert torch.equal(env.reset()["view"], begun["view"])
-
-
-def test_what_is_seen_turns_with_the_agent() -> None:
-    level = ViewLevel.from_text("G....\n.....\n>....")
-    env = ViewMazeEnv(level)
-    state = env.reset()
-    across, along = AGENT_PLACE
-    # Looking right, the goal is two cells to the left of the agent, in line with it.
-    assert (state["view"] == GOAL_OBJECT).nonzero().tolist() == [[across - 2, along]]
-    state = env.step(state.set("action", torch.tensor(0)))["next"]
-    # After a turn to the left it is straight ahead.
-    assert (state["view"] == GOAL_OBJECT).nonzero().tolist() == [[across, along - 2]]
-
-
-def test_a_goal_at_the_limit_is_reached_and_not_cut_off() -> None:
-    env = ViewMazeEnv(ViewLevel.from_text([">.G", "<.G"]), max_steps=2)
-    rollout = env.rollout(2, lambda td: td.set("action", torch.tensor([2, 2])))["next"]
-    assert rollout["terminated"].flatten().tolist() == [False, True, False, False]
-    assert rollout["truncated"].flatten().tolist() == [False, False, False, True]
-    assert rollout["reward"].flatten().tolist() == pytest.approx([0.0, 0.1, 0.0, 0.0])

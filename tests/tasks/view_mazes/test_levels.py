@@ -204,17 +204,12 @@ def test_without_lengths_a_goal_may_be_out_of_reach() -> None:
     [
         (lambda: ViewDistribution(PerfectSettings(), 4, 5, CPU), "odd sides, got 4x5"),
         (lambda: ViewDistribution(ScatteredSettings(most=24), 5, 5, CPU), "at most 23 walls"),
-        (
-            lambda: solvable(lambda n: ViewLevel.from_text([">#G"] * n), 2),
-            "could not be reached",
-        ),
+        (lambda: solvable(lambda n: ViewLevel.from_text([">#G"] * n), 2), "could not be reached"),
         (lambda: ViewSpace(ViewSpaceSettings(walls=[24]), 5, 5, CPU), "at most 23 walls"),
-        (
-            lambda: ViewSpace(ViewSpaceSettings(walls=[0], path_lengths=[9]), 5, 5, CPU),
-            "path_length=9",
-        ),
+        (lambda: ViewSpace(ViewSpaceSettings(walls=[0], path_lengths=[9]), 5, 5, CPU),
+         "path_length=9"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_drawn_is_refused(make: Callable[[], object], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         make()

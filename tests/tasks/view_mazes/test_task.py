@@ -37,13 +37,6 @@ def test_the_fields_numbers_are_the_default() -> None:
     assert config.curriculum["score"] == "max_mc" and config.curriculum["capacity"] == 4000
 
 
-def test_metrics_repeat_and_are_said_to_be_played() -> None:
-    task = tiny_view_task()
-    agent = task.learner([Streams(0)]).agent
-    assert bool((task.measure(agent) == task.measure(agent)).all())
-    assert not task.exact_performance and task.facts["exact"] is False
-
-
 def test_edits_keep_levels_valid_their_class_and_their_directions() -> None:
     task = tiny_view_task()
     levels = task.space.sample(12, Streams(0).generator()).reshape(2, 6)
