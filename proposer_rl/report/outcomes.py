@@ -85,10 +85,10 @@ class Row(NamedTuple):
         difference: of the means over seeds, method minus baseline, with its interval.
         decision: against the baseline; None for the baseline itself.
         asked: whether the decision is among those that are corrected together.
-        says: the difference and its cost in words, as far as the decision.
-        reached: updates to the threshold; over several tasks on how many it is reached.
-        frames, seconds: as factors of the baseline's.
-        worst: over several tasks the lowest difference, and where.
+        says: the difference and its cost in words, without the decision.
+        reached: updates to the threshold; over several tasks the number of those that reach it.
+        frames, seconds: as multiples of the baseline's.
+        worst: over several tasks the lowest difference and its task.
     """
 
     label: str
