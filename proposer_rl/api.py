@@ -1,4 +1,4 @@
-"""The front door: training from Python, and the names of ``proposer_rl`` itself."""
+"""Trains from Python, reads runs, and holds the public names of ``proposer_rl``."""
 
 from __future__ import annotations
 
@@ -132,11 +132,11 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Run:
-    """A run's folder, read.
+    """Reads a run's folder.
 
     Attributes:
-        folder: its path, which is made absolute; what ``bin/watch``, ``bin/report``, ``bin/eval``
-            and ``bin/play`` take, too.
+        folder: the absolute path, which ``bin/watch``, ``bin/report``, ``bin/eval`` and
+            ``bin/play`` also take.
     """
 
     folder: Path
@@ -151,18 +151,18 @@ class Run:
 
     @property
     def training(self) -> pd.DataFrame:
-        """A row for each measurement: the levels that were trained on, and PPO's numbers."""
+        """A row for each measurement: features of the levels trained on, and PPO's numbers."""
         return self._table("training.csv")
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The run's last measurements, its costs, and when it reached the threshold."""
+        """The last measurements, the costs, and when the run reached the threshold."""
         content: dict[str, Any] = json.loads((self.folder / "summary.json").read_bytes())
         return content
 
     @property
     def picture(self) -> Path:
-        """Learning curves and levels, a PNG."""
+        """The path of a PNG with learning curves and levels."""
         return self.folder / "run.png"
 
     def solver(self) -> ActorCritic:
@@ -173,7 +173,7 @@ class Run:
         """Returns one trained Solver for Gymnasium, TorchRL and ``torch.export``.
 
         Args:
-            seed: whose, of a run of several seeds; None for the first.
+            seed: of the Solver, in a run of several seeds; None for the first.
         """
         from proposer_rl.cli.stored import stored_run
         from proposer_rl.tasks.policy import policy_of
@@ -183,7 +183,7 @@ class Run:
         return policy_of(run.task, run.stage(seeds=[chosen]).learner)
 
     def task(self) -> Task:
-        """Returns the task that they were trained on."""
+        """Returns the task that the run trained on."""
         return self._stored()[0]
 
     def _stored(self) -> tuple[Task, ActorCritic]:
@@ -212,21 +212,21 @@ def train(
 ) -> Run:
     """Trains a Solver on a task with a curriculum.
 
-    The run is that of ``bin/train`` with the same settings, to the bit on one machine, and so is
-    its folder. Called again with the same folder, it goes on with a run that was interrupted.
+    The run is the same as that of ``bin/train`` with the same settings, bit for bit on one machine.
+    Called again with the same folder, the function resumes a run that was interrupted.
 
     Args:
         task: ``prl.tasks.NAME(...)``, or the name alone.
-        curriculum: ``prl.curricula.NAME(...)``, or the name alone; without one
+        curriculum: ``prl.curricula.NAME(...)``, or the name alone; the default is
             ``prl.DEFAULT_METHOD``.
-        scale: how much is computed, for tasks that have scales: ``"smoke"``, ``"quick"``,
+        scale: of the computation, for tasks that have scales: ``"smoke"``, ``"quick"``,
             ``"medium"`` or ``"paper"``; None for the task's own numbers.
         filter: of the proposed levels: ``"learnability"`` or another name in ``conf/filter``, or
-            its settings, those of its model included; None for what the curriculum has by default.
-        updates: of the Solver; None for the task's or scale's number.
+            settings of a filter and its model; None for the curriculum's default.
+        updates: of the Solver; None for the number of the task or scale.
         seed: of every random draw.
-        folder: where the files go; None for a new one below ``outputs/``.
-        settings: whatever else ``conf/train.yaml`` has, by its top-level keys, for example
+        folder: for the run's files; None for a new one below ``outputs/``.
+        settings: other keys of ``conf/train.yaml``, for example
             ``{"solver": {"ppo": {"learning_rate": 1e-3}}}``.
         progress: whether to draw a progress bar.
 
@@ -234,15 +234,15 @@ def train(
         The run, with its measurements as tables.
 
     Raises:
-        ValueError: in one line, naming the setting, its value and what is allowed, before anything
-            is written.
-        DivergedError: if a number is not finite; the checkpoint before stays.
-        Interrupted: if a signal asked the run to stop; all is saved then.
+        ValueError: in one line that names the setting, its value and what is allowed, before
+            anything is written.
+        DivergedError: if a number is not finite; the last checkpoint remains.
+        Interrupted: if a signal asked the run to stop, after it has saved a checkpoint.
     """
     state = random.getstate()
     from proposer_rl.cli.compose import compose_and_run
 
-    random.setstate(state)  # rich, which shows a run, draws from it as it is imported
+    random.setstate(state)  # since rich draws from it when it is imported
     arguments(
         train, {"scale": scale, "filter": filter, "folder": folder, "settings": settings}, ["task"]
     )

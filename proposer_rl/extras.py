@@ -1,4 +1,4 @@
-"""Packages that only some runs need, and how they are installed."""
+"""Checks for packages that only some runs need, and says how to install them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def install_command(extra: str) -> str:
-    """Returns the command that installs an extra into this process's environment.
+    """Returns the command that installs an extra into the environment of this process.
 
-    In a checkout it takes the versions that are pinned there. Elsewhere the package is installed
-    already, so that no index is asked for it.
+    In a checkout it uses the versions that are pinned there.
     """
     what = [f"proposer_rl[{extra}]"]
     constraints = ROOT / "constraints.txt"
@@ -24,13 +23,18 @@ def install_command(extra: str) -> str:
 
 
 class MissingPackageError(ImportError):
-    """A package of an extra is not installed; the message is one line that says how to get it."""
+    """A package of an extra is not installed; the message is one line with the command for it."""
 
     exit_code = 2
 
 
 def require_package(what: str, extra: str, *modules: str) -> None:
-    """Checks that what needs an extra has it, before anything is done.
+    """Checks that the packages of an extra are installed.
+
+    Args:
+        what: the setting or command that needs them.
+        extra: the name of the extra.
+        modules: that must be importable.
 
     Raises:
         MissingPackageError: if a module is not installed.
@@ -42,7 +46,7 @@ def require_package(what: str, extra: str, *modules: str) -> None:
 
 
 def where_to_look(error: BaseException) -> str:
-    """Says where a missing module was looked for and how to add it; empty for other errors."""
+    """Returns which Python lacks a module and how to add it; empty for other errors."""
     if not isinstance(error, ModuleNotFoundError):
         return ""
     return (

@@ -86,6 +86,8 @@ WRONG_COMMANDS = [
     (["+method=target", "logger=paper"], "logger/paper: unknown; there are: csv,"),
     (["+method=target", "sede=1"], "sede: unknown; there are: ablation, checkpoint, compute,"),
     (["+method=target", "seed"], "Error parsing override 'seed' missing EQUAL"),
+    (["+method=target", "task.network=[1,2"], "error: task.network=[1,2: "),
+    (["+method=target", "hydra.run.dir=runs/é"], "error: hydra.run.dir=runs/é: "),
     (["+method=target", "seeds=[1,1]"], "seeds=[1, 1]: must be distinct"),
     (["task=cartpole", "+method=target", "+scale=medium"], "scale=medium: is a scale of task=maze"),
     ([], f"method: missing; choose one with +method=NAME, NAME one of: {METHODS}"),
@@ -123,6 +125,18 @@ WRONG_COMMANDS = [
         "curriculum.reward: unknown; there are: checkpoint",
     ),
     (["+method=target", "compute.collector=ray"], "compute.collector=ray: this method trains no"),
+    (
+        ["+method=frozen_proposer", *SMOKE],
+        "curriculum.checkpoint=None: must name a run's folder or a checkpoint that has a Proposer",
+    ),
+    (
+        ["+method=frozen_proposer", *SMOKE, "checkpoint=nowhere"],
+        "curriculum.checkpoint=nowhere: cannot read nowhere: No such file or directory",
+    ),
+    (
+        ["+method=frozen_proposer", *SMOKE, "checkpoint=."],
+        "curriculum.checkpoint=.: the folder holds no checkpoints and no proposer.pt",
+    ),
 ]
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,7 @@ from tests.meta.test_env import SPACE, TASK, E, K, L, P, learners, meta_env, mix
 HELD = {"mix": True, "meta_episode_length": 4, "action_repeat": 2}
 
 
-def cycle(number: int) -> Streams:
-    return Streams(0, "cycle", number)
-
-
-def update(number: int) -> Streams:
-    return Streams(0, "update", number)
+cycle, update = partial(Streams, 0, "cycle"), partial(Streams, 0, "update")
 
 
 def student() -> c.TaskStudent:
@@ -65,6 +61,13 @@ def weights(curriculum: c.ProposerCurriculum) -> TensorDict:
     return curriculum.trainer.learner.snapshot()
 
 
+def improved(**options: Any) -> tuple[c.ProposerCurriculum, c.TaskStudent]:
+    """A Proposer that has learnt for a cycle, and its student."""
+    curriculum, solver = proposer(**options), student()
+    curriculum.improve(solver, cycle(0))
+    return curriculum, solver
+
+
 def test_a_proposer_may_begin_within_a_cycle() -> None:
     stages = [c.SamplingCurriculum(SPACE), proposer(mix=True, action_repeat=L)]
     curriculum = c.Schedule(stages, [1])
@@ -95,8 +98,7 @@ def test_improving_reports_gains_cost_and_proposals() -> None:
 
 
 def test_proposing_costs_an_evaluation_where_an_action_begins() -> None:
-    curriculum, solver = proposer(**HELD), student()
-    curriculum.improve(solver, cycle(0))
+    curriculum, solver = improved(**HELD)
     costs = []
     for _ in range(4):
         solver.frames, solver.evaluations = 0, 0
@@ -107,8 +109,7 @@ def test_proposing_costs_an_evaluation_where_an_action_begins() -> None:
 
 def test_a_restored_proposer_proposes_and_improves_alike() -> None:
     """Also in the middle of an action; tests/curricula/test_contract.py has problem choices."""
-    original, solver = proposer(**HELD), student()
-    original.improve(solver, cycle(0))
+    original, solver = improved(**HELD)
     original.propose(solver, P, update(0))
     resumed = proposer(**HELD)
     resumed.load_state_dict(original.state_dict())
@@ -125,8 +126,7 @@ def test_a_restored_proposer_proposes_and_improves_alike() -> None:
 def test_an_own_action_holds_and_a_mode_is_no_matter_of_chance() -> None:
     actions = {}
     for own in ("sample", "mode"):
-        curriculum, solver = proposer(own_action=own, **HELD), student()
-        curriculum.improve(solver, cycle(0))
+        curriculum, solver = improved(own_action=own, **HELD)
         actions[own] = []
         for number in range(4):
             curriculum.propose(solver, P, update(number))
@@ -141,8 +141,7 @@ def test_an_own_action_holds_and_a_mode_is_no_matter_of_chance() -> None:
 
 @pytest.mark.parametrize("own", ["sample", "mode"])
 def test_a_frozen_one_proposes_what_was_learnt_and_learns_no_more(own: str) -> None:
-    learnt, solver = proposer(own_action=own), student()
-    learnt.improve(solver, cycle(0))
+    learnt, solver = improved(own_action=own)
     # Another network with its weights, as from a checkpoint.
     agent = proposer_agent(mix=False)
     load_agent(agent, weights(learnt))

@@ -95,7 +95,7 @@ NEAR = 0.025  # standard deviation of what is added between two levels, in share
 # grows faster than with the square: of 288, it is 10 ms in blocks of 64, 30 of 128, 150 at once.
 # Of more than LARGE, blocks are half as large, which takes a third of the time.
 AT_ONCE, LARGE = 64, 512
-MOST_LEVELS = 4096  # candidates of a batch, where more are wanted where it is concentrated
+MOST_LEVELS = 3072  # candidates of a batch, where more are wanted where it is concentrated
 FORBIDDEN = 1e3  # cost of a candidate that is not mastered
 FAILURES = 4.0  # on the target, that are taken for seen at the beginning
 SHOWN = 6  # levels of each arm that a reader is shown
