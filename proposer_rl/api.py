@@ -250,7 +250,8 @@ def train(
     curriculum = as_recipe("curriculum", "method", curriculum)
     words, filtered = filter_asked(filter)
     words = [*task.words, *curriculum.words, *([f"scale={scale}"] if scale else []), *words]
-    more: dict[str, Any] = {"seed": seed, "compute": {"progress": progress}}
+    words.append(f"seed={seed}")
+    more: dict[str, Any] = {"compute": {"progress": progress}}
     if updates is not None:
         more["schedule"] = {"updates": updates}
     asked = [task.settings, curriculum.settings, filtered, more, settings or {}]

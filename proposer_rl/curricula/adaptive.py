@@ -75,7 +75,7 @@ SUMS = (
     *("failures", "failed", "squared failed"),  # of which the last two are returns
 )
 FLOOR, LOW, HIGH = 0.1, 0.25, 0.9  # of the share of the target
-# b at half of the distance from low to HIGH; where success is not told
+# b at half of the distance from low to HIGH; without successes
 HALF, HALF_OF_RETURNS = 0.1, 0.5
 # part q: with no skill it is that in the middle
 BRIDGE_LEAST, BRIDGE_AT_ONCE, BRIDGE_MOST = 0.2, 0.4, 0.8
@@ -125,7 +125,7 @@ class AdaptiveMixture(Curriculum):
         times: candidates for each level of the bridge.
         concentrate: whether the bridge gets nearly all of a batch while uniform levels are seldom
             solved and failures all return the same, and the target's share rises later there. It
-            changes nothing for a data set, and where success is not told.
+            changes nothing for a data set, and where no success is told.
     """
 
     optional_results = ("success",)
