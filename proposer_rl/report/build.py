@@ -98,7 +98,7 @@ def write_report(
         meanings: what methods and ablations do, by ``method`` or ``ablation`` and name, for runs
             that do not tell.
     """
-    check_output(output, PAGE, f"{TABLES}/runs.csv")
+    check_output(output, PAGE)
     logs = [path for path in folders if path.suffix == LOG]
     curves = teachers.read_curves(logs)
     of_runs = [path for path in folders if path.suffix != LOG]

@@ -332,7 +332,6 @@ def _differing(leaves: Sequence[Mapping[str, str]]) -> list[str]:
 def _leaves(value: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
     if isinstance(value, Mapping):
         for key, item in value.items():
-            name = json.dumps(key)[1:-1]  # it may hold whatever JSON can
-            yield from _leaves(item, f"{prefix}.{name}" if prefix else name)
+            yield from _leaves(item, f"{prefix}.{key}" if prefix else key)
     else:
         yield prefix, json.dumps(value)
