@@ -21,7 +21,6 @@ from torchrl.objectives import ClipPPOLoss, LossModule
 from torchrl.objectives.value import GAE
 from torchrl.objectives.value.functional import reward2go
 
-from proposer_rl.models import ActorCritic
 from proposer_rl.settings import settings
 
 LEAST_DISCOUNT = 1e-7  # below this the next reward vanishes in float32
@@ -153,18 +152,6 @@ ACTED_VALUE = "acted_value"
 
 # From an actor and a critic that read what stands in a tensordict already, to a loss of both.
 MakeLoss = Callable[[TensorDictModuleBase, TensorDictModule], LossModule]
-
-
-def make_loss(make: MakeLoss, agent: ActorCritic) -> LossModule:
-    """Makes the loss of an agent's actor and critic from the entries that the agent writes.
-
-    Raises:
-        ValueError: if the loss averages over replicas.
-    """
-    loss = make(*agent.readout())
-    if loss.reduction != "none":
-        raise ValueError(f'reduction of the loss must be "none", got {loss.reduction!r}')
-    return loss.to(next(agent.parameters()).device)
 
 
 class CopiesClipLoss(ClipPPOLoss):

@@ -101,7 +101,10 @@ class PPO:
             normalize_advantage=settings.normalize_advantage and self._minibatches.steps > 1,
             clip_value=settings.clip_value,
         )
-        self._loss = objective.make_loss(loss or clipped, agent)
+        made = (loss or clipped)(*agent.readout())
+        if made.reduction != "none":
+            raise ValueError(f'reduction of the loss must be "none", got {made.reduction!r}')
+        self._loss = made.to(next(agent.parameters()).device)
         self._parameters = list(agent.parameters())
         self._adam = complete_adam(self._parameters, settings.learning_rate, settings.adam_eps)
         self._gradient_steps = 0
