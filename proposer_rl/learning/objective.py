@@ -99,10 +99,12 @@ class SolverSettings:
     ppo: PPOSettings = PPOSettings()
 
 
-def gae(gamma: float, lmbda: float) -> GAE:
+def gae(gamma: float, lmbda: float, value_key: str) -> GAE:
     """Makes TorchRL's generalised advantage estimation for rollouts that contain values."""
     # The vectorised form splits the batch at the ends of episodes, and would wait for the device.
-    return GAE(gamma=gamma, lmbda=lmbda, value_network=None, vectorized=False)
+    estimator = GAE(gamma=gamma, lmbda=lmbda, value_network=None, vectorized=False)
+    estimator.set_keys(value=value_key)
+    return estimator
 
 
 class LeaveOneOutBaseline(TensorDictModuleBase):
@@ -226,9 +228,9 @@ def of_copies(numbers: Tensor, copies: int | None) -> Tensor:
     return numbers.flatten(0 if copies is None else 1).mean(-1)
 
 
-def explained_variance(steps: TensorDictBase, copies: int | None) -> Tensor:
+def explained_variance(steps: TensorDictBase, value_key: str, copies: int | None) -> Tensor:
     """Returns the share of the targets' variance that the values explain, [K] or []."""
-    value, target = steps["state_value"].detach(), steps["value_target"]
+    value, target = steps[value_key].detach(), steps["value_target"]
     batch = 0 if copies is None else 1
     residual, total = (x.flatten(batch).var(-1, correction=0) for x in (target - value, target))
     return 1 - residual / total.clamp_min(1e-12)
