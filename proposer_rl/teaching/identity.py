@@ -11,7 +11,6 @@ from proposer_rl.settings import ArgumentError
 from proposer_rl.task import Levels, level_inputs
 
 SHOWN = 3  # number of differences in an error
-LONGEST = 60  # number of letters of a value in it
 
 
 def of_levels(space: Any, like: Levels) -> dict[str, Any]:
@@ -44,7 +43,10 @@ def require_same(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -
     # If anything else differs, it explains differences in the entries of levels.
     differ = [name for name in differ if not name.startswith("levels.")] or differ
     if differ:
-        lines = [f"{name} was {_said(old, name)}, is {_said(new, name)}" for name in differ[:SHOWN]]
+        lines = [
+            f"{name} was {old.get(name, 'missing')!s:.60}, is {new.get(name, 'missing')!s:.60}"
+            for name in differ[:SHOWN]
+        ]
         more = f"; and {len(differ) - SHOWN} more" if len(differ) > SHOWN else ""
         raise ArgumentError(f"state: belongs to another {what}: {'; '.join(lines)}{more}")
 
@@ -55,8 +57,3 @@ def _flat(description: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[st
             yield from _flat(value, f"{prefix}{name}.")
         else:
             yield prefix + name, value
-
-
-def _said(description: Mapping[str, Any], name: str) -> str:
-    text = str(description[name]) if name in description else "missing"
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."

@@ -158,10 +158,13 @@ class TeacherSampler(Sampler[int]):
         between 0 and 1; ``no_variance``, the share of the others; and the same by source, as
         ``yield/SOURCE``. Empty if there was no group.
         """
-        means = {name: total / number for name, (total, number) in self._sums.items()}
+        shown: dict[str, float] = {}
+        for name, (total, number) in self._sums.items():
+            shown[name] = total / number
+            if name.startswith("yield"):
+                shown[f"no_variance{name[5:]}"] = 1 - shown[name]
         self._sums = {}
-        mixed = [name for name in means if name.startswith("yield")]
-        return means | {f"no_variance{name[5:]}": 1 - means[name] for name in mixed}
+        return shown
 
     def state_dict(self) -> dict[str, Any]:
         """Returns what is out and the place in the epoch, without the teacher's state."""
@@ -338,7 +341,6 @@ def _everywhere(read: Callable[[], list[T]], trace: int) -> list[T]:
     said = [(trace, error, mine)]
     if distributed.is_available() and distributed.is_initialized():
         said *= distributed.get_world_size()
-    if len(said) > 1:
         distributed.all_gather_object(said, said[0])
     if len({trace for trace, _, _ in said}) > 1:
         raise ArgumentError(

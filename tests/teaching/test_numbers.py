@@ -233,14 +233,9 @@ def unsuccessful_rollouts() -> None:
 def test_what_may_be_misread_is_said_once(misread: Callable[[], None], message: str) -> None:
     with pytest.warns(UserWarning, match=message) as said:
         misread()
+        told("adaptive_mixture", 0, 1)()  # of success that is told, or not used, nothing is said
+        told("plr", None, None)()
     assert len(said) == 1
-
-
-@pytest.mark.parametrize("told_", [told("adaptive_mixture", 0, 1), told("plr", None, None)])
-def test_nothing_is_said_of_success_that_is_told_or_not_used(told_: Callable[[], None]) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        told_()
 
 
 def doubles(n: int, generator: torch.Generator) -> torch.Tensor:
@@ -280,19 +275,15 @@ def test_an_array_that_a_function_draws_is_a_tensor() -> None:
 
 LOW = {"low": 0, "high": 9}
 NINE, TEXTS = {"g": range(9)}, {"g": ["a", "b"]}
-MASKED = np.ma.array([[0.0], [9.0]], mask=[[0], [1]])
 P, D, PLR = prl.Parameters, prl.Items, partial(prl.Teacher, "plr")
 WRONG: list[tuple[Any, Any, dict[str, Any], str]] = [
     (P, {"g": ["a", "b", "a"]}, {}, "ranges.g=.*: values=.*: must have each once"),
-    (P, TEXTS, {"target": {"g": []}}, r"target.g=\[\]: must be among"),
     (P, {"g": (0.0, HUGE)}, {}, r"ranges.g=\(0.0, 1e\+39\): .* both finite, at"),
     (P, {"g": (0, 10**400)}, {}, r"ranges.g=\(0, 10{70}.*too large"),
     (P, {"g": []}, {}, r"ranges.g=\[\]: must be \(low, high\), a range or a list"),
     (P, {"g": {**LOW, "target": [5, 11]}}, {}, r"target.g=\(5, 11\): must lie within 0 to 9"),
-    (P, {"g": LOW}, {"target": {"g": {**NORMAL, "scale": 0}}}, "target.g.scale=0: input should"),
     (P, TEXTS, {"target": {"g": ["a", "a"]}}, r"target.g=.*\['a', 'b'\], each once"),
     (P, NINE, {"target": {"g": 2.5}}, "target.g=2.5: must be whole, as the range is"),
-    (P, NINE, {"target": {"g": ["a"]}}, r"target.g=\['a'\]: must be "),
     (P, NINE, {"target": {"h": 1}}, "target.h: unknown; there are: g"),
     (P, NINE, {"bins": {"h": 2}}, "bins.h: unknown; there are: g"),
     (P, NINE, {"bins": {"g": np.float64(2)}}, "bins.g=2.0: must be a wh"),
@@ -302,11 +293,10 @@ WRONG: list[tuple[Any, Any, dict[str, Any], str]] = [
     (D, 2, {"features": np.array([[HUGE], [0]])}, "features=1e[+]39: must be finite"),
     (D, 2, {"features": {"a": ["x", "y"], "b": [1, {}]}}, "features.b=.*: must be numbers of"),
     (D, 300, {"features": [*map(str, range(300))]}, "features.0: has 300 different texts, .* 256"),
-    (D, 2, {"pass_rates": [0.5]}, r"pass_rates: has shape \[1\], but must have \[2\]"),
-    (D, 2, {"pass_rates": [0.5, 1.5]}, "pass_rates=1.5: must be from 0 to 1"),
     (D, 2, {"features": [1.0, 2.0]}, r"features: has shape \[2\], but must have \[2, n\]"),
-    (D, 2, {"features": MASKED}, "features=nan: "),
-    (PLR, LINE, {"seed": True}, "seed=True: must be a whole number"),
+    (D, 2, {"features": np.ma.array([[0], [9]], mask=[[0], [1]])}, "features=nan: "),
+    (D, 2, {"pass_rates": [0.5, 1.5]}, "pass_rates=1.5: must be from 0 to 1"),
+    (D, 2, {"pass_rates": [0.5]}, r"pass_rates: has shape \[1\], but must have \[2\]"),
     (PLR, LINE, {"sing": abs}, "sing: unknown; there are: play, "),
     (PLR, {"s": (0.0, 1.0)}, {}, "space={'s': .*: must be Parameters, Items"),
     (prl.Teacher, "prl", {"space": LINE}, "curriculum='prl': must be .* one of accel"),

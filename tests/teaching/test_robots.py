@@ -168,21 +168,6 @@ def test_ranks_draw_levels_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None
         assert (log["proposed"], log["out"]) == (COUNT, COUNT)
 
 
-def test_what_is_wrong_is_named_and_counts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = Robots()
-    term = Levels(None, env)
-    term(env, slice(None))
-    env.step([1, 2])
-    monkeypatch.setattr(term, "results", lambda ids: (torch.ones(2), None))
-    before, levels = term.tickets.clone(), {name: x.clone() for name, x in env.levels.items()}
-    with pytest.raises(prl.ArgumentError, match=r"^success: missing: this"):
-        term(env, [1, 2])
-    log = term.teacher.log()
-    assert (log["told"], log["dropped"], log["out"]) == (0, 0, COUNT)
-    assert (term.tickets == before).all()
-    assert all((env.levels[name] == x).all() for name, x in levels.items())
-
-
 @pytest.mark.parametrize(
     ("env_ids", "told"),
     [
@@ -205,18 +190,29 @@ def test_environments_are_named_as_they_index_a_tensor(env_ids: Any, told: int) 
     assert term.teacher.log()["told"] == told
 
 
-def test_a_refused_state_leaves_a_term_that_goes_on() -> None:
+def test_what_is_refused_leaves_a_term_that_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A state of another curriculum, and results without the success that it requires."""
+
     class Bounds(Levels):
         def make_teacher(self) -> prl.Teacher:
             return prl.Teacher("adr", SPACE, block=1)
 
-    env, other = Robots(), Robots()
-    state, term = Levels(None, env).state_dict(), Bounds(None, other)
-    term(other, None)
+    env = Robots()
+    state, term = Levels(None, Robots()).state_dict(), Bounds(None, env)
+    term(env, None)
     with pytest.raises(prl.ArgumentError, match="kind was terrain_levels, is adr"):
         term.load_state_dict(state)
-    term(other, other.step([1, 2]))
+    term(env, env.step([1, 2]))
     assert term.teacher.log()["told"] == 0
+    env.after([1, 2])
+    env.step([1, 2])
+    monkeypatch.setattr(term, "results", lambda ids: (torch.ones(2), None))
+    before, levels = term.tickets.clone(), {name: x.clone() for name, x in env.levels.items()}
+    with pytest.raises(prl.ArgumentError, match=r"^success: missing: this"):
+        term(env, [1, 2])
+    log = term.teacher.log()
+    assert (log["told"], log["dropped"]) == (0, 0) and (term.tickets == before).all()
+    assert all((env.levels[name] == x).all() for name, x in levels.items())
 
 
 def test_thousands_of_robots_get_levels_one_by_one() -> None:

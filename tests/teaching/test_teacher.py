@@ -163,30 +163,22 @@ def ranges(**given: Any) -> prl.Parameters:
     return prl.Parameters(ONE, **given)
 
 
-def drawn(shape: int, known: int = 0) -> prl.LevelGenerator:
-    return prl.LevelGenerator(
-        lambda n, g: torch.rand(n, shape, generator=g), features=lambda levels: levels[:, :known]
-    )
+def drawn(shape: int) -> prl.LevelGenerator:
+    return prl.LevelGenerator(lambda n, g: torch.rand(n, shape, generator=g))
 
 
 GROUND = ["flat", "stairs", "gap"]
 EYE = prl.Items(100, features=torch.eye(100))
-MORE = prl.Parameters({**ONE, "wind": range(9)}, bins=4)
 ORDERS = [prl.Parameters({"ground": order}) for order in (GROUND, GROUND[::-1])]
-EASY = [ranges(named={"easy": {"slope": slope}}) for slope in (1, 2)]
 OTHERS: dict[str, tuple[Any, Any, str]] = {
-    "a parameter more": (ranges(), MORE, "ranges.wind was missing, is 0 to 8, whole"),
     "renamed": (ranges(), prl.Parameters({"angle": (0.0, 8.0)}), "ranges.slope was 0 to 8, is mis"),
     "a bit smaller": (ranges(), prl.Parameters({"slope": (0.0, 7.9999999)}), "is 0 to 7.9999999"),
-    "fewer items": (ITEMS, prl.Items(10), "count was 100, is 10"),
     "other features": (ITEMS, EYE, "feat"),
     "another target": (prl.Items(9, target=[1]), prl.Items(9, target=[2]), r"was \[1\], is \[2\]"),
     "no target": (ranges(target={"slope": 8}), ranges(), "target.slope was .8.*, is missing"),
-    "another name": (*EASY, "named.easy.slope was .1"),
     "another order": (*ORDERS, r"ranges.ground was \['flat', .*\], is \['gap', 'stairs', 'flat'\]"),
     "seeds": (ranges(), ranges(seeded=True), "seeded was False, is True"),
     "a shape": (drawn(3), drawn(4), r"level was torch.float32 \[3\], is torch.float32 \[4\]"),
-    "features": (drawn(3, 2), drawn(3, 3), "levels.number of features was 2, is 3$"),
     "a task": (drawn(3), TASK, "kind was LevelGenerator, is "),
 }  # fmt: skip
 
@@ -257,20 +249,17 @@ LOGGED = ["proposed", "told", "dropped", "out", "mean_return", "mean_success", "
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("name", ["domain_randomization", "plr"])
 def test_a_log_counts_what_went_out_and_came_back(name: str, space: str, tmp_path: Path) -> None:
-    """Against counts of the levels themselves; and what a loop does without it, it does with it."""
-    teacher, silent = (prl.Teacher(name, SPACES[space](), block=8) for _ in range(2))
-    file, levels = tmp_path / "log.jsonl", []
-    for some in (teacher, silent):
-        ids, asked = some.ask(11)
-        ticket, _ = some.ask()
-        some.tell(ticket, 3.0)
-        some.tell(ids[:4], torch.arange(4.0), [1, 1, 0, 1])
-        some.drop(ids[4:6])
-        levels = [asked, some.propose(5)]
-        some.observe({"return": [1.0] * 5})
-        if some is teacher:
-            log = some.log(file)
-            assert [*log][-7:] == LOGGED
+    """Against counts of the levels themselves."""
+    teacher, file = prl.Teacher(name, SPACES[space](), block=8), tmp_path / "log.jsonl"
+    ids, asked = teacher.ask(11)
+    ticket, _ = teacher.ask()
+    teacher.tell(ticket, 3.0)
+    teacher.tell(ids[:4], torch.arange(4.0), [1, 1, 0, 1])
+    teacher.drop(ids[4:6])
+    levels = [asked, teacher.propose(5)]
+    teacher.observe({"return": [1.0] * 5})
+    log = teacher.log(file)
+    assert [*log][-7:] == LOGGED
     counted = {key: log[key] for key in LOGGED[:6]}
     assert counted == {
         **{"proposed": 17, "told": 10, "dropped": 2, "out": 5},
@@ -292,11 +281,10 @@ def test_a_log_counts_what_went_out_and_came_back(name: str, space: str, tmp_pat
         for one in (log, empty)
     ]
     resumed = prl.Teacher(name, SPACES[space](), block=8)
-    assert len({teacher.id, silent.id, resumed.id}) == 3
+    assert resumed.id != teacher.id
     teacher.drop()
     resumed.load_state_dict(teacher.state_dict())
     assert resumed.id == teacher.id
-    assert same(plain(teacher.ask(20)[1]), plain(silent.ask(20)[1]))
 
 
 def test_parameters_are_counted_and_known_each_by_bins_of_its_own() -> None:
@@ -388,6 +376,7 @@ REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
     "told twice": (lambda t: [t.tell(0, 0.0, 1)] * 2 and t.tell(0, 0.0, 1), "ids=0: "),
     "twice at once": (lambda t: t.tell([1, 0, 1], [0.0] * 3, [1] * 3), "ids=1: "),
     "not finite, several": (lambda t: t.tell([0, 1], [0.0, NAN], [1, 1]), "return_=nan: must be"),
+    "masked among others": (lambda t: t.tell([0, 1], [0.0, np.ma.masked], [1, 1]), "return_=nan"),
     "masked tickets": (lambda t: t.tell(MASKED.astype(int), [0.0, 1.0], [1, 1]), "ids=.*: must be"),
     "no success": (lambda t: t.tell(0, 1.0), "success: missing: this curriculum requires it; tell"),
     "no episodes": (lambda t: t.tell(0, 1.0, 1, episodes=0), "episodes=0.0: must be a whole"),

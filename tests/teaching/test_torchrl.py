@@ -177,12 +177,6 @@ def test_environments_in_other_processes_have_one_teacher(monkeypatch: pytest.Mo
     assert len(came) > 6 and not begun[0] & begun[1]
 
 
-def test_whole_rollouts_are_not_told() -> None:
-    env = taught(counted("rollout"))
-    with pytest.raises(ArgumentError, match=r"rollout: missing: .*LevelTransform.tell=False"):
-        env.rollout(9, break_when_any_done=False)
-
-
 BETWEEN = [lambda env: env, lambda env: TransformedEnv(env, StepCounter())]
 
 
@@ -210,16 +204,15 @@ def test_an_environment_has_one_teacher(same: bool, unwrapped: bool, between: An
 @pytest.mark.filterwarnings("ignore")
 def test_environments_that_reset_themselves_are_refused() -> None:
     """They would begin each episode on the level of the one before."""
-    for mode in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED):
+
+    def play(mode: AutoresetMode) -> None:
         vector = SyncVectorEnv([partial(gymnasium.make, "CartPole-v1")] * 2, autoreset_mode=mode)
-        teacher = counted()
-        transform = prl.LevelTransform(teacher, lambda env, levels: None)
-        env = TransformedEnv(GymWrapper(vector), transform)
-        if mode is AutoresetMode.DISABLED:
-            env.rollout(3)
-            continue
-        with pytest.raises(ArgumentError, match="env: resets itself at the end of an ep"):
-            env.rollout(3)
+        transform = prl.LevelTransform(counted(), lambda env, levels: None)
+        TransformedEnv(GymWrapper(vector), transform).rollout(3)
+
+    play(AutoresetMode.DISABLED)
+    with pytest.raises(ArgumentError, match="env: resets itself at the end of an ep"):
+        play(AutoresetMode.SAME_STEP)
 
 
 class Several(LevelsEnv):
@@ -252,23 +245,19 @@ def test_environments_that_set_level_cannot_reach_are_refused(kind: Any) -> None
     assert teacher.ask()[0] == 0  # no level is lost
 
 
-@pytest.mark.parametrize(
-    ("rewards", "reward"),
-    [(AGENTS, ("agents", "reward")), (OBJECTIVES, "reward"), (AGENTS, lambda after: torch.ones(1))],
-)
-def test_there_must_be_one_reward_for_each_environment(rewards: Any, reward: Any) -> None:
-    """One for all would be broadcast; by torch, whose line names both sizes."""
-    transform = prl.LevelTransform(counted(), set_level, reward=reward)
-    with pytest.raises(RuntimeError, match=r"shape '\[3\]' is invalid for input of size"):
-        TransformedEnv(Several(*rewards), transform).rollout(2)
-
-
 @pytest.mark.parametrize("rewards", [AGENTS, OBJECTIVES])
 def test_a_function_makes_one_reward_of_several(rewards: Any) -> None:
+    """One for all would be broadcast, and several are too many; by torch, which names both."""
     teacher = counted("success")
-    how = {"reward": lambda after: after[rewards[0]].flatten(1).sum(-1, keepdim=True)}
-    env = TransformedEnv(Several(*rewards), prl.LevelTransform(teacher, set_level, **how))
-    env.rollout(12, break_when_any_done=False)
+
+    def play(reward: Any) -> None:
+        transform = prl.LevelTransform(teacher, set_level, reward=reward)
+        TransformedEnv(Several(*rewards), transform).rollout(12, break_when_any_done=False)
+
+    for wrong in (rewards[0], lambda after: torch.ones(1)):
+        with pytest.raises(RuntimeError, match=r"shape '\[3\]' is invalid for input of size"):
+            play(wrong)
+    play(lambda after: after[rewards[0]].flatten(1).sum(-1, keepdim=True))
     came = seen(teacher)
     check(came)
     assert len(came) > 3
@@ -303,7 +292,7 @@ def test_mazes_say_what_is_a_success() -> None:
     assert [success for _, success in teacher.curriculum.seen.values()] == [1.0, 0.0]
 
 
-def test_success_is_asked_for() -> None:
+def test_results_that_a_curriculum_requires_are_asked_for() -> None:
     def told(**how: Any) -> set[float]:
         teacher = counted("success")
         silent = ExcludeTransform("success")
@@ -313,6 +302,8 @@ def test_success_is_asked_for() -> None:
 
     with pytest.raises(ArgumentError, match=r'success: missing: .*success="terminated" to Lev'):
         told()
+    with pytest.raises(ArgumentError, match=r"rollout: missing: .*LevelTransform.tell=False"):
+        taught(counted("rollout")).rollout(9, break_when_any_done=False)
     assert told(success="terminated") == {1.0}
     assert told(success=lambda after: ~after["terminated"]) == {0.0}
 
