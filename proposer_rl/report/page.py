@@ -264,7 +264,7 @@ def _command(run: Run) -> str:
         named: dict[str, Any] = dict(word.lstrip("+").split("=", 1) for word in words)
         named.pop("seed", None)
         given = {"task": named.pop("task", ""), "curriculum": named.pop("method"), **named}
-        given["settings"] = {k: v for k, v in settings.items() if k != "compute"}
+        given["settings"] = {k: v for k, v in settings.items() if k not in ("seed", "compute")}
         call = ", ".join(f"{name}={value!r}" for name, value in given.items())
         return f"prl.train({call}{')' if run.shared_by > 1 else ', seed=seed)  # seed='}"
     arguments = run.facts.get("arguments", {})
