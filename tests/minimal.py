@@ -18,13 +18,11 @@ import sys
 import traceback
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import redirect_stdout
 from functools import cache
 from importlib import metadata
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 
@@ -177,30 +175,8 @@ def _call(command: Callable[..., Any], name: str, arguments: list[str]) -> None:
         assert not end.code, f"{sys.argv} ended with {end.code}"
 
 
-def _play(command: Callable[..., Any], arguments: list[str]) -> None:
-    """Open the page that the command serves, and end it."""
-    import signal
-    import urllib.request
-
-    said, says = os.pipe()
-    lines = open(said)  # noqa: SIM115  until nothing more is written
-    pages = []
-
-    def visit() -> None:
-        try:
-            address = lines.readline().split()[1]
-            with urllib.request.urlopen(address, timeout=LONGEST) as page:
-                pages.append(page.read())
-        finally:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    # No fork, which could wait for ever for what threads of the training hold.
-    visitor = Thread(target=visit, daemon=True)
-    visitor.start()
-    with open(says, "w", buffering=1) as output, redirect_stdout(output):
-        _call(command, "play", arguments)
-    visitor.join()
-    assert b"<html" in pages[0]
+def _interrupted(*_: Any, **__: Any) -> None:
+    raise KeyboardInterrupt
 
 
 def _undrawn(folder: Path, title: str) -> Path:
@@ -220,10 +196,11 @@ def _run(extra: str) -> None:
             from proposer_rl.report import build
 
             build.DRAWINGS = build.DRAWINGS[::3]  # curves, maps, and what was recorded
-        if name == "play":
-            _play(command, arguments)
-        else:
-            _call(command, name, arguments)
+        if name == "play":  # until it would serve its page, which is among the wheel's files
+            import uvicorn
+
+            uvicorn.Server.run = _interrupted
+        _call(command, name, arguments)
         print("DID", name, *arguments, flush=True)
         watch.draw_run = _undrawn
     if extra == "":

@@ -139,7 +139,7 @@ def read_config(config: DictConfig) -> RunConfig:
     values = completed(values)
     if isinstance(values.get("task"), dict):  # first, since other settings refer to its values
         task_maker(values["task"])
-    read = RunConfig(**arguments(RunConfig, values))
+    read = RunConfig(**values)
     if read.checkpoint is not None and read.checkpoint not in read.curriculum.values():
         raise ConfigError(
             f"checkpoint={read.checkpoint}: has no effect with method={read.method}, which has no "
@@ -176,7 +176,7 @@ def checked_config(values: Mapping[str, Any], file: Path) -> RunConfig:
     """Returns the settings that a run stored in a file, except where it was computed."""
     free = {"compute": {"threads": 1, "progress": False}, "logger": {"type": "csv"}}
     try:
-        return RunConfig(**arguments(RunConfig, {**values, **free}))
+        return RunConfig(**{**values, **free})
     except (ValueError, TypeError) as error:
         raise ConfigError(f"{file}: not the settings of a run of this version: {error}") from error
 

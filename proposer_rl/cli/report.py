@@ -38,7 +38,7 @@ def _run(options: argparse.Namespace) -> None:
     from proposer_rl.report.reading import find_runs
     from proposer_rl.runs.records import printable
 
-    # Refuses what is none, before what takes seconds to import.
+    # Refuse wrong folders before slow imports.
     find_runs([path for path in options.folder if path.suffix != ".jsonl"])
     compare = re.split(r",(?! )", options.compare) if options.compare else ()
     asked = options.threshold, options.baseline or (), compare

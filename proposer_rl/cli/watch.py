@@ -37,7 +37,7 @@ examples:
 BLOCKS = " ▁▂▃▄▅▆▇█"
 COLOURS = {"finished": "green", "failed": "red", "unfinished": "yellow", "starting": "blue"}
 WIDTH = 16  # characters of a curve
-STOPPED = 128  # a greater exit code is that of a signal: the run can go on
+STOPPED = 128  # greater exit codes are of signals, after which a run can be resumed
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -168,7 +168,7 @@ def _seconds_since(folder: Path) -> float:
     """Returns how long ago something in a folder was written; 0 where it is empty."""
     times = []
     for entry in os.scandir(folder):
-        with suppress(FileNotFoundError):  # its temporary name is gone once a file is written
+        with suppress(FileNotFoundError):  # a temporary file may have got its name meanwhile
             if entry.is_file():
                 times.append(entry.stat().st_mtime)
     return max(time.time() - max(times), 0.0) if times else 0.0
@@ -207,7 +207,7 @@ def _measured(runs: Sequence[Run]) -> tuple[str, str, str]:
     if not runs:
         return "–", "", ""
     run = runs[0]
-    # Of seeds that are trained together one can have a row more than another.
+    # A seed can be one row ahead of those that are trained with it.
     known = min(len(each.metrics[run.headline]) for each in runs)
     values = np.mean([each.metrics[run.headline][:known] for each in runs], 0)
     low, high = (0, 1) if is_rate(run.headline) else (float(values.min()), float(values.max()))

@@ -101,9 +101,8 @@ class Ledger:
     def states(self, ids: Ids) -> NDArray[np.uint8]:
         """Returns the states of ids [n]; an unknown id counts as waiting."""
         states = np.where((ids >= 0) & (ids < self.next), OVER, WAITING).astype(np.uint8)
-        for block in self.blocks:
-            inside = (ids >= block.start) & (ids < block.end)
-            states[inside] = block.state[ids[inside] - block.start]
+        for block, which, place in self._located(ids):
+            states[which] = block.state[place]
         return states
 
     def find(self, ids: Ids) -> list[Found]:
@@ -112,24 +111,22 @@ class Ledger:
         Raises:
             ArgumentError: for an id that is not handed out, or is given twice.
         """
-        number = np.searchsorted([block.start for block in self.blocks], ids, "right")
+        states = self.states(ids)
+        for wrong in np.flatnonzero(states != OUT)[:1]:
+            self._refuse(int(ids[wrong]), states[wrong])
+        known, counts = np.unique(ids, return_counts=True)
+        for twice in known[counts > 1][:1]:
+            raise ArgumentError(f"ids={twice}: is there more than once")
+        return self._located(ids)
+
+    def _located(self, ids: Ids) -> list[Found]:
+        """Locates those of ids [n] whose blocks are not over."""
+        number = np.searchsorted([block.start for block in self.blocks], ids, "right") - 1
         parts = []
-        for each in np.flatnonzero(np.bincount(number)).tolist():
-            which = np.flatnonzero(number == each)
-            if not each:
-                self._refuse(int(ids[which[0]]), OVER)
-            block = self.blocks[each - 1]
-            place = ids[which] - block.start
-            states = block.state.take(place, mode="clip")
-            states[place >= block.end - block.start] = OVER  # ids between blocks are over
-            wrong = np.flatnonzero(states != OUT)
-            if len(wrong):
-                self._refuse(int(ids[which[wrong[0]]]), states[wrong[0]])
-            parts.append(Found(block, which, place))
-        rising = np.sort(ids)
-        twice = rising[1:][rising[1:] == rising[:-1]]
-        if len(twice):
-            raise ArgumentError(f"ids={twice[0]}: is there more than once")
+        for each in np.unique(number[number >= 0]).tolist():
+            block = self.blocks[each]
+            which = np.flatnonzero((number == each) & (ids < block.end))
+            parts.append(Found(block, which, ids[which] - block.start))
         return parts
 
     def hand_out(self, id: int) -> Levels:
@@ -214,7 +211,7 @@ class Ledger:
                 if kind is object:
                     block.results[name][ready] = None
         self.returned = False
-        self.blocks = [b for b in self.blocks if not _is_over(b)]
+        self.blocks = [block for block in self.blocks if (block.state != OVER).any()]
 
     def _refuse(self, id: int, state: int) -> NoReturn:
         known = 0 <= id < self.next
@@ -265,11 +262,6 @@ class Ledger:
             }
             self.blocks.append(block)
         self.next, self.returned = state["next"], state["returned"]
-
-
-def _is_over(block: Block) -> bool:
-    waits = bool((block.state == WAITING).any())
-    return not waits and bool((block.state == OVER).all())
 
 
 def _saved(result: NDArray[Any]) -> Any:

@@ -72,6 +72,7 @@ class ProblemProposer(CountingCurriculum):
             normalize_advantage=True,
             functional=False,
         ).to(device_of(target.sample(1, torch.Generator())))  # its numbers are tensors
+        self._loss.set_keys(action=agent.action_key, sample_log_prob=agent.log_prob_key)
         self._parameters = [p for p in agent.parameters() if p.requires_grad]
         self._adam = torch.optim.Adam(
             self._parameters, lr=settings.learning_rate, eps=settings.adam_eps
@@ -106,8 +107,8 @@ class ProblemProposer(CountingCurriculum):
         levels = levels_in(self.space, bins, rng.generator("levels"))
         reward, metrics = self.reward(student, levels, rng)
         drawn = {
-            "action": choices,
-            "action_log_prob": log_prob,
+            agent.action_key: choices,
+            agent.log_prob_key: log_prob,
             "advantage": reward.view(*choices.shape, 1),
         }
         self._learn(seen, TensorDict(drawn, choices.shape))
@@ -139,9 +140,9 @@ class ProblemProposer(CountingCurriculum):
         """Makes a few gradient steps on draws [times, 1, P]."""
         steps = []
         for _ in range(self._settings.epochs):
-            logits = self.agent(seen.copy())["logits"]  # [1, P, N]
+            logits = self.agent(seen.copy())[self.agent.logits_key]  # [1, P, N]
             everywhere = logits.expand(len(played), -1, -1, -1)
-            losses = self._loss(played.copy().set("logits", everywhere))
+            losses = self._loss(played.copy().set(self.agent.logits_key, everywhere))
             self._adam.zero_grad()
             (losses["loss_objective"] + losses["loss_entropy"]).backward()
             norm = nn.utils.clip_grad_norm_(self._parameters, self._settings.max_grad_norm)

@@ -256,7 +256,7 @@ def advantages(student: Student, rollout: TensorDictBase, lmbda: float | None = 
     """
     for steps in (rollout, rollout["next"]):
         values(steps)
-    estimate = gae(student.gamma, student.lmbda if lmbda is None else lmbda)
+    estimate = gae(student.gamma, student.lmbda if lmbda is None else lmbda, VALUE)
     return estimate(rollout.copy())["advantage"].squeeze(-1).double()
 
 

@@ -59,7 +59,7 @@ def play_episodes(
         else:
             given = noise[step, place]
             action = draw_at(distribution, given.expand(len(over), *given.shape))
-        after = env.step(state.set("action", action))["next"]
+        after = env.step(state.set(agent.action_key, action))["next"]
         yield place, after, ~over
         over = over | after["done"].squeeze(-1)
         state = after.exclude("reward")
@@ -117,7 +117,7 @@ def mean_performance(
                 int(torch.randint(SEEDS, (), generator=generator))
             )
         env = make_env(some)
-        device, shape = env.device, env.full_action_spec["action"].shape[1:]
+        device, shape = env.device, env.full_action_spec[agent.action_key].shape[1:]
         noise = None if greedy else torch.rand(max_steps, *shape, generator=draws).to(device)
         returns, success = torch.zeros(2, *some.batch_size, device=device)
         remake = (lambda place, some=some: make_env(some[:, place])) if drop_finished else None

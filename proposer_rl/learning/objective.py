@@ -21,7 +21,6 @@ from torchrl.objectives import ClipPPOLoss, LossModule
 from torchrl.objectives.value import GAE
 from torchrl.objectives.value.functional import reward2go
 
-from proposer_rl.models import ActorCritic
 from proposer_rl.settings import settings
 
 LEAST_DISCOUNT = 1e-7  # below this the next reward vanishes in float32
@@ -100,10 +99,12 @@ class SolverSettings:
     ppo: PPOSettings = PPOSettings()
 
 
-def gae(gamma: float, lmbda: float) -> GAE:
+def gae(gamma: float, lmbda: float, value_key: str) -> GAE:
     """Makes TorchRL's generalised advantage estimation for rollouts that contain values."""
     # The vectorised form splits the batch at the ends of episodes, and would wait for the device.
-    return GAE(gamma=gamma, lmbda=lmbda, value_network=None, vectorized=False)
+    estimator = GAE(gamma=gamma, lmbda=lmbda, value_network=None, vectorized=False)
+    estimator.set_keys(value=value_key)
+    return estimator
 
 
 class LeaveOneOutBaseline(TensorDictModuleBase):
@@ -153,18 +154,6 @@ ACTED_VALUE = "acted_value"
 
 # From an actor and a critic that read what stands in a tensordict already, to a loss of both.
 MakeLoss = Callable[[TensorDictModuleBase, TensorDictModule], LossModule]
-
-
-def make_loss(make: MakeLoss, agent: ActorCritic) -> LossModule:
-    """Makes the loss of an agent's actor and critic from the entries that the agent writes.
-
-    Raises:
-        ValueError: if the loss averages over replicas.
-    """
-    loss = make(*agent.readout())
-    if loss.reduction != "none":
-        raise ValueError(f'reduction of the loss must be "none", got {loss.reduction!r}')
-    return loss.to(next(agent.parameters()).device)
 
 
 class CopiesClipLoss(ClipPPOLoss):
@@ -239,9 +228,9 @@ def of_copies(numbers: Tensor, copies: int | None) -> Tensor:
     return numbers.flatten(0 if copies is None else 1).mean(-1)
 
 
-def explained_variance(steps: TensorDictBase, copies: int | None) -> Tensor:
+def explained_variance(steps: TensorDictBase, value_key: str, copies: int | None) -> Tensor:
     """Returns the share of the targets' variance that the values explain, [K] or []."""
-    value, target = steps["state_value"].detach(), steps["value_target"]
+    value, target = steps[value_key].detach(), steps["value_target"]
     batch = 0 if copies is None else 1
     residual, total = (x.flatten(batch).var(-1, correction=0) for x in (target - value, target))
     return 1 - residual / total.clamp_min(1e-12)

@@ -31,7 +31,6 @@ from proposer_rl.learning.rollout import RolloutCollector, set_next_values, set_
 from proposer_rl.learning.training_batch import Minibatches, Statistics
 from proposer_rl.models import ActorCritic, Population, one_copy
 
-VALUES = ("state_value", ("next", "state_value"))
 DIAGNOSTICS = ("entropy", "kl_approx", "clip_fraction")  # besides the terms, if a loss has them
 
 
@@ -91,7 +90,9 @@ class PPO:
         )
         self._minibatches = Minibatches(agent, env.batch_size, settings)
         self.statistics = Statistics(env, agent, settings)
-        self._advantage = advantage or objective.gae(settings.gamma, settings.lmbda)
+        self._advantage = advantage or objective.gae(
+            settings.gamma, settings.lmbda, agent.value_key
+        )
         clipped = partial(
             objective.CopiesClipLoss,
             copies=agent.copies,
@@ -101,7 +102,13 @@ class PPO:
             normalize_advantage=settings.normalize_advantage and self._minibatches.steps > 1,
             clip_value=settings.clip_value,
         )
-        self._loss = objective.make_loss(loss or clipped, agent)
+        made = (loss or clipped)(*agent.readout())
+        if made.reduction != "none":
+            raise ValueError(f'reduction of the loss must be "none", got {made.reduction!r}')
+        made.set_keys(
+            action=agent.action_key, sample_log_prob=agent.log_prob_key, value=agent.value_key
+        )
+        self._loss = made.to(next(agent.parameters()).device)
         self._parameters = list(agent.parameters())
         self._adam = complete_adam(self._parameters, settings.learning_rate, settings.adam_eps)
         self._gradient_steps = 0
@@ -187,19 +194,19 @@ class PPO:
             ``gradient_steps`` [S] or [S, K], the metrics of each; and ``steps`` with the values,
             advantages and targets that were computed.
         """
-        steps, level = batch["steps"].copy(), batch["level"]
+        steps, level, value = batch["steps"].copy(), batch["level"], self.agent.value_key
         taken = []
         for update in range(self.settings.updates):
             if update:
                 set_values(self.agent, steps, level)
             self._advantage(steps)
             if self.settings.clip_value is not None:
-                steps.set(objective.ACTED_VALUE, steps["state_value"])
+                steps.set(objective.ACTED_VALUE, steps[value])
             for epoch in range(self.settings.epochs):
                 order = batch.get(f"order_{update}_{epoch}", None)
                 parts = self._minibatches(steps, level, order)
                 taken += [self._gradient_step(*part) for part in parts]
-        computed = steps.select(*VALUES, "advantage", "value_target")
+        computed = steps.select(value, ("next", value), "advantage", "value_target")
         return TensorDict({"steps": computed, "gradient_steps": TensorDict.stack(taken)})
 
     def _gradient_step(self, steps: TensorDictBase, level: TensorDictBase) -> TensorDict:
@@ -224,7 +231,7 @@ class PPO:
             if key.startswith("loss_") or key in DIAGNOSTICS
         }
         terms = [metric for key, metric in metrics.items() if key.startswith("loss_")]
-        metrics["explained_variance"] = objective.explained_variance(steps, copies)
+        metrics["explained_variance"] = objective.explained_variance(steps, agent.value_key, copies)
         return torch.stack(terms).sum(), {key: metric.detach() for key, metric in metrics.items()}
 
     def complete(self, rollout: TensorDictBase) -> TensorDictBase:

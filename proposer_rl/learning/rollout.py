@@ -49,7 +49,7 @@ class RolloutCollector:
         self.episodes = ContinuedEpisodes(env) if continued else None
         self.memory: TensorDictBase | None = None
         self._agent = agent
-        self._action = env.full_action_spec["action"]
+        self._action = env.full_action_spec[agent.action_key]
         self._horizon = horizon
         self._level = _LevelAside(*agent.level_keys) if agent.level_keys else None
         self._policy = RolloutPolicy(agent, self._level)
@@ -175,7 +175,7 @@ def set_values(agent: ActorCritic, steps: TensorDictBase, level: TensorDictBase)
     context = agent.encode(level)
     with set_recurrent_mode(True):
         now = agent.decode(steps.select(*agent.step_keys), context)
-    for key in ("state_value", *agent.memory_keys):
+    for key in (agent.value_key, *agent.memory_keys):
         steps.set(key, now.get(key))
     set_next_values(agent, steps, context)
 
@@ -187,9 +187,10 @@ def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDi
     Values use the memory after each step. If an episode goes on, the value after a step is the
     value before the next one, which an agent that reads each step by itself does not compute again.
     """
-    after, value = steps.get("next").select(*agent.step_keys), steps.get("state_value")
+    after, key = steps.get("next").select(*agent.step_keys), agent.value_key
+    value = steps.get(key)
     if agent.level_keys or not population.at_hand(value):  # to count is to wait
-        steps.set(("next", "state_value"), agent.decode(after, context).get("state_value"))
+        steps.set(("next", key), agent.decode(after, context).get(key))
         return
     shape = (agent.copies or 1, -1)
     unknown = steps.get(("next", "done")).squeeze(-1).clone()
@@ -203,8 +204,8 @@ def set_next_values(agent: ActorCritic, steps: TensorDictBase, context: TensorDi
     if agent.copies is None:
         asked = asked.squeeze(0)
     values = torch.cat([value[..., 1:, :], value[..., -1:, :]], -2).reshape(*unknown.shape, 1)
-    values[rows] = agent.decode(asked, context).get("state_value").reshape(*which.shape, 1)
-    steps.set(("next", "state_value"), values.view(value.shape))
+    values[rows] = agent.decode(asked, context).get(key).reshape(*which.shape, 1)
+    steps.set(("next", key), values.view(value.shape))
 
 
 class RolloutPolicy(TensorDictModuleBase):
@@ -226,8 +227,13 @@ class RolloutPolicy(TensorDictModuleBase):
         # In tuples, nn.Module does not register them.
         self._agent, self._level = (agent,), (level,)
         self.in_keys = agent.step_keys
-        written = ("action", "action_log_prob", "state_value")
-        self.out_keys = [*written, *agent.memory, *agent.memory_keys]
+        self.out_keys = [
+            agent.action_key,
+            agent.log_prob_key,
+            agent.value_key,
+            *agent.memory,
+            *agent.memory_keys,
+        ]
 
     def begin(self, noise: Tensor, memory: TensorDictBase | None = None) -> None:
         """Prepares the next rollout.
@@ -251,12 +257,12 @@ class RolloutPolicy(TensorDictModuleBase):
         step = agent.decode(tensordict.select(*agent.step_keys), self.context)
         distribution = agent.distribution(step)
         action = draw_at(distribution, noise)
-        tensordict.set("action", action)
-        tensordict.set("action_log_prob", distribution.log_prob(action))
+        tensordict.set(agent.action_key, action)
+        tensordict.set(agent.log_prob_key, distribution.log_prob(action))
         for before, after in zip(agent.memory, agent.memory_keys, strict=True):
             self.memory.set(before, step.get(after))
             tensordict.set(after, step.get(after))
-        return tensordict.set("state_value", step.get("state_value"))
+        return tensordict.set(agent.value_key, step.get(agent.value_key))
 
 
 class _LevelAside(ExcludeTransform):

@@ -81,8 +81,8 @@ class Minibatches:
         used = steps.select(
             *agent.step_keys,
             *agent.memory,
-            "action",
-            "action_log_prob",
+            agent.action_key,
+            agent.log_prob_key,
             "advantage",
             "value_target",
             ACTED_VALUE,
@@ -148,15 +148,15 @@ class Statistics:
         agent, normalization = self._agent, self._agent.normalization
         if normalization is None:
             return
-        unit = normalization.unit(rollout["state_value"])
+        unit = normalization.unit(rollout[agent.value_key])
         if normalization.returns is not None:
             normalization.returns.update(self._discounted(rollout))
         if first:
             normalization.update_observations(rollout)
             set_values(agent, rollout, level)
         else:
-            change = normalization.unit(rollout["state_value"]) / unit
-            for key in ("state_value", ("next", "state_value")):
+            change = normalization.unit(rollout[agent.value_key]) / unit
+            for key in (agent.value_key, ("next", agent.value_key)):
                 rollout.set(key, rollout[key] * change)
 
     def after(self, rollout: TensorDictBase, *, first: bool) -> None:
@@ -166,12 +166,10 @@ class Statistics:
 
     def in_units(self, steps: TensorDictBase) -> TensorDictBase:
         """Divides values, targets and advantages by the unit of the agent's values."""
-        normalization = self._agent.normalization
+        value, normalization = self._agent.value_key, self._agent.normalization
         if normalization is not None and normalization.returns is not None:
-            unit = normalization.unit(steps["state_value"])
-            for key in {"state_value", ACTED_VALUE, "value_target", "advantage"} & set(
-                steps.keys()
-            ):
+            unit = normalization.unit(steps[value])
+            for key in {value, ACTED_VALUE, "value_target", "advantage"} & set(steps.keys()):
                 steps.set(key, steps[key] / unit)
         return steps
 

@@ -256,7 +256,7 @@ def log_probabilities(agent: ActorCritic, rollout: TensorDictBase) -> Tensor:
     context = agent.encode(rollout.select(*agent.level_keys)[..., 0])
     with set_recurrent_mode(True):
         steps = agent.decode(rollout.select(*agent.step_keys), context)
-    log_prob = agent.distribution(steps).log_prob(rollout["action"])
+    log_prob = agent.distribution(steps).log_prob(rollout[agent.action_key])
     # An action of several parts has one log-probability for each of them.
     return log_prob.reshape(*rollout.batch_size, -1).sum(-1)
 

@@ -152,7 +152,7 @@ class ReplicasInWorkers(Replicas):
         """Starts workers, each with an environment and a policy."""
         horizon, threads = self._proposer.settings.horizon, torch.get_num_threads()
         agent = deepcopy(self._proposer.agent).cpu()
-        shape = self._env.full_action_spec["action"].shape[1:]
+        shape = self._env.full_action_spec[agent.action_key].shape[1:]
         placed = list(zip(self._shares, cycle(self._settings.devices), strict=False))
         return start(
             self._settings,

@@ -33,13 +33,14 @@ class ActorCritic(TensorDictModuleBase):
     context, with the same numbers and T times less arithmetic.
 
     Args:
-        head: reads the encoder's outputs and the observation of a step, and writes ``logits`` and
-            ``state_value``. With an encoder, every other input may have time dimensions after the
+        head: reads the encoder's outputs and the observation of a step, and writes ``logits_key``
+            and ``value_key``. With an encoder, every other input may have time dimensions after the
             batch dimensions, [*B, *T, ...], and then the outputs have them too.
         encoder: reads what is constant within a level; None if nothing is.
         distribution_class: builds the action's distribution from ``logits=``.
         copies: K if parameters and data have independent replicas as their first dimension
             (:class:`~proposer_rl.models.Population`), None for a single network.
+        action_key, log_prob_key, logits_key, value_key: the names of the entries.
         memory: widths of the head's memory by entry name. The head reads these entries, zeros at
             first, writes them below ``next``, and goes through time if TorchRL's
             ``recurrent_mode()`` is on (:func:`~proposer_rl.models.memory_actor_critic`).
@@ -55,18 +56,24 @@ class ActorCritic(TensorDictModuleBase):
         *,
         distribution_class: Callable[..., Distribution] = Categorical,
         copies: int | None = None,
+        action_key: str = "action",
+        log_prob_key: str = "action_log_prob",
+        logits_key: str = "logits",
+        value_key: str = "state_value",
         memory: Mapping[str, int] | None = None,
     ) -> None:
         super().__init__()
         self.head, self.encoder = head, encoder
         self.distribution_class, self.copies = distribution_class, copies
+        self.action_key, self.log_prob_key = action_key, log_prob_key
+        self.logits_key, self.value_key = logits_key, value_key
         self.level_keys = list(encoder.in_keys) if encoder is not None else []
         self.context_keys = list(encoder.out_keys) if encoder is not None else []
         self.step_keys = [key for key in head.in_keys if key not in self.context_keys]
         self.in_keys = [*self.level_keys, *self.step_keys]
         self.memory = dict(memory or {})
         self.memory_keys = [("next", key) for key in self.memory]
-        self.out_keys = ["logits", "state_value", *self.memory_keys]
+        self.out_keys = [logits_key, value_key, *self.memory_keys]
         self.normalization: Normalization | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -101,8 +108,8 @@ class ActorCritic(TensorDictModuleBase):
         if self.normalization is None:
             return self.head(inputs)
         outputs = self.head(self.normalization.seen(inputs))
-        value = outputs.get("state_value")
-        return outputs.set("state_value", value * self.normalization.unit(value))
+        value = outputs.get(self.value_key)
+        return outputs.set(self.value_key, value * self.normalization.unit(value))
 
     def no_memory(self, tensordict: TensorDictBase) -> TensorDict:
         """Returns the memory before the first step of a batch [*B]: zeros."""
@@ -113,16 +120,16 @@ class ActorCritic(TensorDictModuleBase):
 
     def distribution(self, tensordict: TensorDictBase) -> Distribution:
         """Returns the distribution of the action, given a tensordict with logits."""
-        return self.distribution_class(logits=tensordict.get("logits"))
+        return self.distribution_class(logits=tensordict.get(self.logits_key))
 
     def sampler(self, *, sample: bool = False) -> ProbabilisticTensorDictModule:
         """Returns the module from logits to an action and its probability; see :meth:`actor`."""
         return ProbabilisticTensorDictModule(
-            in_keys=["logits"],
-            out_keys=["action"],
+            in_keys={"logits": self.logits_key},
+            out_keys=[self.action_key],
             distribution_class=self.distribution_class,
             return_log_prob=True,
-            log_prob_key="action_log_prob",
+            log_prob_key=self.log_prob_key,
             default_interaction_type=getattr(
                 InteractionType, "RANDOM" if sample else "DETERMINISTIC"
             ),
@@ -160,8 +167,8 @@ class ActorCritic(TensorDictModuleBase):
         For a TorchRL loss whose caller has already run this module, so that actor and critic share
         one forward pass.
         """
-        logits = TensorDictModule(nn.Identity(), ["logits"], ["logits"])
-        value = TensorDictModule(nn.Identity(), ["state_value"], ["state_value"])
+        logits = TensorDictModule(nn.Identity(), [self.logits_key], [self.logits_key])
+        value = TensorDictModule(nn.Identity(), [self.value_key], [self.value_key])
         return ProbabilisticTensorDictSequential(logits, self.sampler()), value
 
 

@@ -1,8 +1,8 @@
 """Serves the page of the game to a browser on this machine, and to nobody else.
 
-Other pages in the same browser are strangers: they do not know the token in the address, may not
-read answers of another origin, and cannot pretend to be this host. Nothing is written, and no file
-is read but those of the page, which are in memory, and the run's.
+Other pages in the same browser get nothing: they do not know the token in the address, may not read
+answers of another origin, and cannot pretend to be this host. The server writes nothing, and reads
+only the files of the page, which are in memory, and those of the run.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from proposer_rl.runs.records import checked, printable
 HOSTS = ["127.0.0.1", "localhost"]
 STATIC = Path(__file__).parent / "static"
 TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
-# Scripts, styles and connections of this server alone; pictures also as data, as records have them.
+# Only scripts, styles and connections of this server; pictures also as data, as in records.
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"

@@ -31,7 +31,7 @@ class Examine(BaseModel):
     """A request for what a Solver does on a drawing.
 
     Attributes:
-        checkpoint: its number, one of those that the run has.
+        checkpoint: the number of one of the run's checkpoints.
         solver: the Solver's number among those that were trained side by side.
         rows: the drawing.
         max_steps: step limit; None for the task's choice.
@@ -94,7 +94,7 @@ class Session:
         self, *, folder: Path, title: str, task: Task, seeds: Sequence[int], load: Load
     ) -> None:
         self._folder, self._title, self._task, self._seeds = folder, title, task, seeds
-        # By the file's time, too: a run that is resumed may write a checkpoint anew.
+        # Keyed by the file's time, too, since a resumed run may rewrite a checkpoint.
         self._load = lru_cache(KEPT)(lambda file, _written: load(file))
         self._lock = Lock()
         self._board = task.board if isinstance(task, PlayableTask) else None
@@ -158,7 +158,7 @@ class Session:
         """Returns the text of a file with a drawing.
 
         Raises:
-            ValueError: if it cannot stand in a file.
+            ValueError: if a file cannot hold it.
         """
         board = self._require_board()
         return {"text": board.write_file(question.name, board.read(question.rows))}

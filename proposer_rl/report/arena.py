@@ -51,7 +51,7 @@ class Arena:
         outcome = primary(study)
         found = difference(outcome, groups[0], groups[1])
         few = min(len(group.runs) for group in groups if group) < FEWEST
-        # Without spread, as where nobody ever succeeds, a task adds nothing to the error of a mean.
+        # A task without any spread, as where no run ever succeeds, adds no error to a mean.
         return found if few or not math.isnan(found.error) else found._replace(error=0.0)
 
     @cached_property
@@ -150,7 +150,8 @@ def arena(studies: Sequence[Study], baselines: Sequence[str] = ()) -> Arena | No
 
     Args:
         studies: each a task.
-        baselines: labels; of none uniform levels and the target alone, or the one that was run.
+        baselines: labels; by default those of uniform levels and the target alone, or the one of
+            these that was run.
     """
     for chosen in [tuple(baselines)] if baselines else [USUAL_BASELINES, *zip(USUAL_BASELINES)]:
         fit = [

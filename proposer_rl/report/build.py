@@ -36,7 +36,7 @@ DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
     figures.recorded_by_curricula,
 )
 
-# These are no charts, so that the page has them as pictures.
+# The page has no charts of these, so it embeds them as pictures.
 STILL = {figures.side_by_side, figures.recorded_by_curricula}
 
 # A caveat on means over the worst share of the levels, by whether measurements are exact.
@@ -86,19 +86,20 @@ def write_report(
     """Writes a report and returns the path of its page.
 
     Args:
-        folders: of runs, or with runs in them; or files of ``teacher.log``, ``*.jsonl``.
-        output: folder to write to; a report in it is replaced, other files stay.
+        folders: run folders or folders that contain some; or files of ``teacher.log``, ``*.jsonl``.
+        output: folder to write to; a report in it is replaced, and other files stay.
         threshold: of the headline measurement, in place of the runs' own.
-        baselines: labels of methods that the others are measured against: on each task the first,
-            over several tasks the best of all. Without any ``domain_randomization`` or, where that
-            is missing, the first; over several tasks ``domain_randomization`` and ``target``.
-        compare: labels of the methods whose comparison was planned: p-values are corrected for
-            these alone; of none for all methods.
+        baselines: labels of the methods that others are compared with: on each task the first, and
+            over several tasks the best of them. The default is ``domain_randomization`` or, where
+            that is missing, the first method; over several tasks ``domain_randomization`` and
+            ``target``.
+        compare: labels of the methods whose comparison was planned, for which alone p-values are
+            corrected; by default all methods.
         progress: whether to draw a progress bar.
         meanings: what methods and ablations do, by ``method`` or ``ablation`` and name, for runs
             that do not tell.
     """
-    check_output(output, PAGE, f"{TABLES}/runs.csv")
+    check_output(output, PAGE)
     logs = [path for path in folders if path.suffix == LOG]
     curves = teachers.read_curves(logs)
     of_runs = [path for path in folders if path.suffix != LOG]
@@ -116,7 +117,7 @@ def write_report(
     ) as bar:
         for study in studies:
             prefix = f"{_slug(study.title)}_" if len(studies) > 1 else ""
-            if f"{TABLES}/{prefix}runs.csv" in files:  # of one title, but measured otherwise
+            if f"{TABLES}/{prefix}runs.csv" in files:  # same title, other measurements
                 prefix += f"{len(sections) + 1}_"
             sections.append(_section(study, prefix, files, bar, meanings or {}))
             parts.append(page.section(study, f"{FIGURES}/{prefix}"))
@@ -136,7 +137,7 @@ def write_report(
         teachers=told,
     )
     files["report.md"] = encoded(page.document(parts, command, notes))
-    for path in (output / FIGURES, output / TABLES):  # what a former report had in them goes
+    for path in (output / FIGURES, output / TABLES):  # remove what a former report left
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         path.mkdir(parents=True)

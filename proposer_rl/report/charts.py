@@ -34,13 +34,12 @@ def charts(study: Study) -> dict[str, Json]:
     """Returns the numbers of all charts of a study, ready for JSON.
 
     Returns:
-        ``methods``: each with its seeds. ``axes``: what can be on the abscissa.
-        ``measures``: each by axis with median and interval of every method, ``rows`` of its runs,
-        and their ``seeds``; null where there is none.
-        ``outcomes``: each with the mean and the runs' values. ``levels``: of every measurement
-        that two methods have for single levels what each reaches there, null without records.
-        ``baseline``: the method's number. ``headline``: its name, and whether it is a rate.
-        ``stages``: what the slider shows, null without any.
+        ``methods``: labels and seeds. ``axes``: the possible abscissas. ``measures``: by axis the
+        median and interval of every method, with the ``rows`` and ``seeds`` of its runs, or null.
+        ``outcomes``: means, and the values of runs. ``levels``: each method's results on single
+        levels, or null, of every measurement that two methods recorded. ``baseline``: the method's
+        number. ``headline``: its name, and whether it is a rate. ``stages``: of the slider, or
+        null.
     """
     return {
         "methods": [{"label": group.label, "seeds": group.seeds} for group in study.groups],

@@ -17,7 +17,7 @@ from proposer_rl.report.studies import Group, Study
 from proposer_rl.runs.folder import is_rate
 from proposer_rl.runs.records import level_text, words
 
-ALIKE = 0.1  # of a rate: differences below it are small, and who gained less learnt nothing
+ALIKE = 0.1  # of a rate: smaller differences are small, and smaller gains are no learning
 
 TOO_FEW, UNDECIDED, NOT_LEARNT = "too few seeds", "no significant difference", "nothing learnt"
 
@@ -57,10 +57,10 @@ class Decision(NamedTuple):
         winner: its label; None where neither is said to be better.
         verdict: in a few words.
         p: corrected for the number of comparisons; NaN where nothing could be tested.
-        reason: what it rests on, in words.
-        seeds: about how many would decide it; None where it is decided or nothing can be said.
+        reason: in words.
+        seeds: about how many would decide it; None where it is decided or this is unknown.
         alone: p without correction.
-        tests: how many p is corrected for.
+        tests: the number of comparisons that p is corrected for.
         leader: label of the one with the higher mean; None if it has hardly learnt.
     """
 
@@ -76,8 +76,8 @@ class Decision(NamedTuple):
     def told(self, label: str) -> str:
         """Returns the decision for one of the two methods in words, with its p.
 
-        An interval is of one comparison: where it excludes zero and the corrected test decides
-        nothing, both p are told.
+        The interval beside it is of one comparison. Where that excludes zero but the corrected test
+        is not significant, the text has both p.
         """
         if math.isnan(self.p):
             return self.verdict if self.verdict == TOO_FEW else f"undecided: {self.reason}"
@@ -103,8 +103,9 @@ def p_text(p: float) -> str:
 def primary(study: Study) -> Outcome:
     """Returns the outcome that decides whether a method beats another.
 
-    The mean of the headline along training: every run has it, whether it gets to the threshold or
-    not; it sees the way and the end; and as a mean over many measurements it varies little.
+    That is the mean of the headline along training. Every run has it, whether it reaches the
+    threshold or not; it depends on the whole of training; and as a mean over many measurements it
+    varies little.
     """
     name, horizon = study.headline, study.horizon
     value = partial(Run.mean_until, measurement=name, budget=horizon)
@@ -175,7 +176,7 @@ def decisions(study: Study, outcome: Outcome | None = None) -> dict[tuple[str, s
 def against_baseline(study: Study) -> dict[str, Decision]:
     """Decides which methods are better or worse than the baseline by the primary outcome.
 
-    Only these tests are corrected together: it is they that were asked for.
+    Only these tests are corrected together, since only they were asked for.
     """
     baseline = study.baseline
     pairs = ((group, baseline) for group in study.asked if group.label != baseline.label)

@@ -128,7 +128,7 @@ def _draw_curves(figure: FigureBase, study: Study, measure: Measure, axis: str =
 def _draw_bars(figure: FigureBase, study: Study) -> None:
     axes = figure.subplots()
     horizon, outcome = study.horizon, waiting_outcome(study)
-    # Every run that is compared has waited, if only until the horizon.
+    # Every run that is compared has a value, at most the horizon.
     found = [(median_interval(outcome.values(group)), group) for group in study.compared]
     found.sort(key=lambda each: -each[0].estimate)
     for place, (interval, group) in enumerate(found):
@@ -148,7 +148,7 @@ def _draw_bars(figure: FigureBase, study: Study) -> None:
             fontsize=8,
         )
     axes.set_yticks(range(len(found)), [fill(group.label, 32) for _, group in found], fontsize=8)
-    axes.set_xlim(0, max(horizon, 1) * 1.42)  # of a run that has just begun
+    axes.set_xlim(0, max(horizon, 1) * 1.42)  # the horizon of a run that has just begun is 0
     axes.set_xticks([tick for tick in axes.get_xticks() if tick <= horizon])
     axes.axvline(horizon, color="0.4", linewidth=0.8, linestyle=":")
     axes.grid(axis="y", visible=False)

@@ -25,7 +25,7 @@ from proposer_rl.runs.records import (
 )
 
 UPDATES = "Solver updates"
-# What training cost beside updates: in words, and of a run at each of its evaluations.
+# Costs of training besides updates, by their names: of a run, at each of its evaluations.
 COSTS: Mapping[str, Callable[[Run], Column]] = {
     "environment frames, millions (all)": lambda run: run.total_frames / 1e6,
     "wall-clock seconds": lambda run: run.own_seconds - run.own_seconds[0],
@@ -48,8 +48,8 @@ RECORDED = "The curricula's own numbers"
 Value = Callable[[Record], float]  # of a cycle; NaN where it has none
 
 
-# A number of a method's runs along an axis: a row for each run, by its seed, and a column for each
-# place on the axis; NaN where a run has none.
+# A number of a method's runs along an axis: a row for each run, indexed by its seed, and a column
+# for each place on the axis; NaN where a run has no value.
 Series: TypeAlias = pd.DataFrame
 
 
@@ -57,9 +57,9 @@ class Measure(NamedTuple):
     """A number of every method along one axis or several.
 
     Attributes:
-        kind: what it is listed under.
-        name: as an axis is named.
-        axes: by the axis the method's series; None where it has none.
+        kind: the heading that it is listed under.
+        name: the title of its axis.
+        axes: a function from a method to its series, or None, by the abscissa.
         rate: whether it goes from 0 to 1.
         log: whether the axis is logarithmic.
     """
@@ -165,7 +165,7 @@ def axis_text(name: str) -> str:
 def over_updates(group: Group, name: str, table: str = "metrics") -> Series | None:
     """Returns a column of a run's ``metrics`` or ``training`` against updates, or None.
 
-    Runs that were evaluated at different updates have no value at those of the others.
+    Runs have no value at updates at which only others were evaluated.
     """
     tables = {run.seed: getattr(run, table) for run in group.runs}
     return _aligned({s: (own["updates"], own[name]) for s, own in tables.items() if name in own})
@@ -174,7 +174,7 @@ def over_updates(group: Group, name: str, table: str = "metrics") -> Series | No
 def over_cost(group: Group, name: str, cost: Callable[[Run], Column]) -> Series | None:
     """Returns a measurement of a group's runs against a cost; None where no run has it.
 
-    Runs stand at different costs when they are measured, so they are interpolated in between.
+    Runs are interpolated, since their evaluations are at different costs.
     """
     runs = [run for run in group.runs if name in run.metrics]
     if not runs:
@@ -203,8 +203,8 @@ def _aligned(runs: Mapping[int, tuple[Iterable[float], Iterable[float]]]) -> Ser
 def worst_means(scores: Column, shares: Column) -> Column:
     """Returns means over the worst shares of the levels, the conditional value at risk (CVaR).
 
-    A level counts in part where the share is no whole number of levels (Acerbi & Tasche, Journal of
-    Banking & Finance 26, 2002, definition 3).
+    A level counts in part where the share is not a whole number of levels (Acerbi & Tasche, Journal
+    of Banking & Finance 26, 2002, definition 3).
 
     Args:
         scores: [runs, levels].

@@ -85,10 +85,10 @@ class Row(NamedTuple):
         difference: of the means over seeds, method minus baseline, with its interval.
         decision: against the baseline; None for the baseline itself.
         asked: whether the decision is among those that are corrected together.
-        says: the difference and its cost in words, as far as the decision.
-        reached: updates to the threshold; over several tasks on how many it is reached.
-        frames, seconds: as factors of the baseline's.
-        worst: over several tasks the lowest difference, and where.
+        says: the difference and its cost in words, without the decision.
+        reached: updates to the threshold; over several tasks the number of those that reach it.
+        frames, seconds: as multiples of the baseline's.
+        worst: over several tasks the lowest difference and its task.
     """
 
     label: str
@@ -211,9 +211,9 @@ def first_table(
 def about_rows(study: Study) -> str:
     """Explains the columns of the first table."""
     return (
-        f"The difference is the method's mean over seeds of {primary(study).name} minus that of "
-        f"{study.baseline.label}, with an uncorrected 95 % interval; methods are sorted by it. p "
-        f"is corrected for the number of comparisons with the baseline, {len(study.asked) - 1} "
+        f"The difference is that in {primary(study).name}: the method's mean over seeds minus that "
+        f"of {study.baseline.label}, with an uncorrected 95 % interval; methods are sorted by it. "
+        f"p is corrected for the number of comparisons with the baseline, {len(study.asked) - 1} "
         "(Holm). Updates are the median over seeds, with the number of runs that reached the "
         "threshold if not all did. × is a multiple of what the baseline spent, including frames of "
         "the curriculum."

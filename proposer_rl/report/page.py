@@ -41,7 +41,7 @@ WIDE = 140  # pixels of the dots of the first table
 DIGIT = 6.5  # pixels of a character of their scale
 
 
-Section = dict[str, Any]  # all that the page shows of a study, as the template names it
+Section = dict[str, Any]  # a section of the page, by the names in the template
 
 
 def render(**content: Any) -> str:
@@ -58,7 +58,7 @@ def render(**content: Any) -> str:
         content,
         script=script,
         library=packed,
-        # Nothing else is run, whatever may have got into the page.
+        # The browser runs only these, even if other scripts had got into the page.
         allowed=" ".join(f"'{_digest(text)}'" for text in (script, library)),
     )
 
@@ -66,7 +66,7 @@ def render(**content: Any) -> str:
 @cache
 def _library() -> tuple[str, str]:
     """Returns the library of the charts, plain and packed; packing takes half a second."""
-    from plotly.offline import get_plotlyjs  # what only draws figures needs no charts
+    from plotly.offline import get_plotlyjs  # large, and not needed for figures
 
     library = get_plotlyjs()
     return library, pack(library)
@@ -210,7 +210,7 @@ def incomplete(study: Study) -> list[str]:
 def commands(study: Study) -> list[str]:
     """Returns the command of each group; one for all seeds that differ in nothing else.
 
-    Seeds that were trained side by side are again, since on some tasks they draw other numbers
+    Seeds that were trained side by side stay together, since on some tasks they draw other numbers
     alone.
     """
     found = []
@@ -257,7 +257,7 @@ def report_command(
 def _command(run: Run) -> str:
     """Returns a run's command, ending in ``seed=`` if it had one seed; empty if not recorded."""
     words = run.facts.get("overrides") or []
-    # A task or curriculum of one's own that prl.train was given is in no override.
+    # A custom task or curriculum that was passed to prl.train is in no override.
     if "~task" in words or not any(word.lstrip("+").startswith("method=") for word in words):
         return ""
     if isinstance(settings := run.facts.get("settings"), dict):  # of prl.train

@@ -94,7 +94,7 @@ def write_study(folder: Path, runs: Sequence[tuple[str, Run]]) -> None:
     for name in NAMES:
         if name not in written:
             (folder / f"{name}.csv.xz").unlink(missing_ok=True)
-    for name, table in reversed(written.items()):  # what makes it a study comes last
+    for name, table in reversed(written.items()):  # runs.csv.xz marks a study, so it comes last
         packed = lzma.compress(to_csv(table), preset=9)
         write_atomically(folder / f"{name}.csv.xz", packed)
 
@@ -107,7 +107,7 @@ def write_page(
 ) -> None:
     """Writes a study's ``README.md`` and its figures from its tables.
 
-    What the page says above :data:`MARK` is its authors' and stays.
+    Text above :data:`MARK` is the authors' and stays.
     """
     studies, _ = read_checked([folder], threshold, baselines, compare)
     file, parts = folder / "README.md", []

@@ -71,7 +71,7 @@ def _walk(folder: Path) -> Iterator[tuple[Path, set[str]]]:
     if not folder.is_dir():
         raise UnreadableRun(f"{folder}: there is no such folder")
     for root, names, files in os.walk(folder):
-        # Hidden are those of a study that is being published.
+        # A study that is being published has hidden folders.
         names[:] = sorted((n for n in names if not n.startswith(".")), key=natural)
         if {"config.json", STUDY} & set(files):
             names.clear()
@@ -83,11 +83,11 @@ def read_run(folder: Path) -> list[Run]:
     """Returns all seeds of a run's folder, or all runs of a study.
 
     Raises:
-        UnreadableRun: with what is wrong; a report leaves the folder out and says so.
+        UnreadableRun: for an invalid folder, with the reason; a report leaves it out and says so.
     """
     try:
         return _read_study(folder) if (folder / STUDY).exists() else _read_folder(folder)
-    except Exception as error:  # of xz and pandas they are of no common kind
+    except Exception as error:  # xz and pandas raise many kinds
         missing = isinstance(error, KeyError)
         reason = f"an entry {error} is missing" if missing else str(error) or repr(error)
         raise UnreadableRun(f"{folder}: {printable(reason)[:300]}") from error
@@ -208,7 +208,7 @@ def _optional(file: Path, read: Callable[[Path], list[Any]]) -> list[Any]:
 
 
 def _read_json(file: Path) -> dict[str, Any]:
-    value = json.loads(file.read_text("utf-8-sig"))  # with the mark of editors of Windows
+    value = json.loads(file.read_text("utf-8-sig"))  # editors on Windows add a byte-order mark
     return checked(dict[str, Any], value, file.name)
 
 

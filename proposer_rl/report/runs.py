@@ -32,10 +32,10 @@ from proposer_rl.runs.records import (
 )
 
 COST = ("updates", "frames", "curriculum_frames", "evaluations", "seconds")
-# Columns of training.csv that are PPO's own, besides its losses; the others are the task's.
+# Columns of training.csv that are PPO's, besides its losses; the others are the task's.
 OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_norm"}
 _STUDENT = re.compile(r"lifetime_(\d{1,9})")
-STUDY = "runs.csv.xz"  # what makes a folder a study's
+STUDY = "runs.csv.xz"  # a folder with this file is a study
 NAMES = ("metrics", "training", "cycles", "levels")
 
 
@@ -44,17 +44,17 @@ class Run:
     """One seed of one run's folder.
 
     Attributes:
-        folder: where it lies.
-        seed: whose rows these are.
+        folder: its folder.
+        seed: its seed.
         shared_by: seeds that were trained side by side in the folder's process.
         config: the settings, as in ``config.json``.
         facts: versions, device, command and length, from ``run.json`` and ``summary.json``.
-        task: what ``run.json`` says of the task.
-        finished: whether it got to the end of its schedule.
+        task: the description of the task in ``run.json``.
+        finished: whether it reached the end of its schedule.
         metrics, training: the tables, float64, a row for each evaluation.
         cycles: what the curriculum recorded, one per cycle; every entry but updates is optional.
         samples: recorded levels, one record per evaluation.
-        levels: what was reached on every level at the end, [levels], by the measurement's column.
+        levels: results on every level at the end, [levels], by the measurement's column.
         sheets: pictures of levels by their captions, as the curriculum recorded them last.
     """
 
@@ -139,7 +139,7 @@ class Run:
     def until(self, horizon: int) -> Run:
         """Returns the run as it was after so many updates, linear between evaluations.
 
-        What is only known of its end is left out. A shorter run stays as it is.
+        Records of its end are left out. A shorter run stays as it is.
         """
         if self.updates <= horizon:
             return self
@@ -166,8 +166,8 @@ class Run:
     def waited(self, measurement: str, threshold: float, horizon: float) -> float:
         """Returns updates until a threshold, cut at a horizon; NaN for a shorter run.
 
-        It is NaN also if a shorter run reached the threshold: else only short runs that are fast
-        would count.
+        A shorter run has NaN even if it reached the threshold, since otherwise of the short runs
+        only the fast ones would count.
         """
         if self.updates < horizon:
             return math.nan
@@ -242,11 +242,11 @@ def tables(runs: Iterable[tuple[str, Run]], key: str = "run") -> dict[str, pd.Da
                 {k: json.dumps(v) for k, v in cycle.items() if v is not None and v == v}
                 for cycle in run.cycles
             )
-            # A curriculum may log a number of that name: a row stays its run's.
+            # A curriculum may log a number called like the key; the run's name wins.
             found["cycles"].append(pd.DataFrame([whose | cycle | {key: name} for cycle in cells]))
         seen.add(run.whose_cycles)
         for distribution in dict.fromkeys(name.rpartition("_")[0] for name in run.levels):
-            # Of returns what is shown: the headline, and where there is no success.
+            # Returns are kept only as the headline, or where there is no success.
             kinds = [
                 kind for kind in ("success", "return") if f"{distribution}_{kind}" in run.levels
             ]

@@ -12,13 +12,13 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # whose functions are loaded where they are asked for: a run's picture asks none
+import scipy  # loads its functions when they are used; drawing a run uses none
 from numpy.typing import NDArray
 
 CONFIDENCE = 0.95
 ERROR = 1 - CONFIDENCE  # how often a test may be wrong
 HELD = 0.93  # how often at least an interval of a median holds it; five runs give 0.9375
-MOST_SEEDS = 1_000_000  # more say that there is no difference to be found
+MOST_SEEDS = 1_000_000  # needing more means that there is no difference
 FEWEST = 5  # runs for an interval
 POWER = 0.8
 
@@ -98,7 +98,7 @@ def difference_of(one: Values, other: Values, paired: bool = False) -> Estimate:
 def mean_of_estimates(found: Sequence[Estimate]) -> Estimate:
     """Returns the unweighted mean of independent estimates.
 
-    Its error is NaN where one of theirs is not known, or none has any.
+    Its error is NaN where one of theirs is unknown, or all are 0.
     """
     value = float(np.mean([one.value for one in found]))
     squares = [one.error**2 for one in found]
@@ -203,7 +203,7 @@ def seeds_needed(difference: Estimate, seeds: int, level: float) -> int | None:
         level: of the two-sided test.
 
     Returns:
-        None where nothing can be said: too few seeds, or no difference at all.
+        None with too few seeds, or without any difference.
     """
     effect = abs(difference.value) / difference.error
     if not effect > 0:

@@ -20,13 +20,13 @@ from proposer_rl.runs.records import Column, natural
 
 USUAL_BASELINE = "domain_randomization"
 LONGEST_LABEL = 40  # characters of the settings in a label
-# What of a command does not make its runs another variant.
+# Beginnings of overrides that do not make a run another variant.
 ASIDE = (
     "method=", "ablation=", "scale=", "seed=", "seeds=", "sweep=", "schedule.", "checkpoint=",
     "compute.", "logger", "hydra.",
 )  # fmt: skip
 
-# A folder's seed, alone or at the end of its name as in those of sweeps.
+# The seed in a folder's name, alone or at the end as in sweeps.
 _SEED_OF_A_FOLDER = re.compile(r"(?:(?<=seed_)|(?<![^/]))[0-9]+(?![^/])")
 
 
@@ -35,9 +35,9 @@ class Group:
     """Runs of one method with the same settings and different seeds.
 
     Attributes:
-        label: what it is called in this report.
+        label: its name in this report.
         runs: in the order of their seeds.
-        setting: in which it differs from groups of the same method; empty if there are none.
+        setting: the settings that tell it from other groups of the method; empty for a lone one.
         look: in figures.
     """
 
@@ -68,12 +68,12 @@ class Study:
 
     Attributes:
         title: the scale and the task.
-        groups: what is compared, by label.
+        groups: the methods and variants, in the order of their labels.
         threshold: of the headline measurement.
         chosen: the label of the baseline that was asked for.
-        planned: labels of the methods that are compared; of none all are.
-        timed: the machine on which all methods were timed in turns; None where seconds are what the
-            runs took.
+        planned: labels of the methods to compare; empty for all.
+        timed: the machine on which all methods were timed in turns; None where seconds are those of
+            the runs.
     """
 
     title: str
@@ -130,7 +130,7 @@ class Study:
     def baseline(self) -> Group:
         """The group that others are compared with: the chosen one, the usual one, or the first.
 
-        Of planned methods without the usual one it is the last.
+        If the usual one is not among the planned methods, it is the last of them.
         """
         usual = USUAL_BASELINE if USUAL_BASELINE in (self.planned or [USUAL_BASELINE]) else ""
         found = map(self.group, [self.chosen or "", usual, *reversed(self.planned)])
@@ -217,8 +217,8 @@ def _variant(run: Run) -> dict[str, Any]:
 
     It consists of settings alone, so that an unfinished run is in the group of its finished ones.
     """
-    ignored = {"seed", "seeds", "schedule", "checkpoint"}  # the curriculum has the last
-    # Proposers that differ in their seed alone are as much a matter of chance as Solvers.
+    ignored = {"seed", "seeds", "schedule", "checkpoint"}  # the curriculum has the checkpoint, too
+    # Proposers that differ only in their seed are samples of one variant, as Solvers are.
     kept = _without_seeds({k: value for k, value in run.config.items() if k not in ignored})
     kept["cycle_length"] = run.config["schedule"].get("cycle_length")
     kept["student"] = run.student
@@ -321,7 +321,7 @@ def _differing(leaves: Sequence[Mapping[str, str]]) -> list[str]:
     """Returns the values of each configuration that are not equal in all."""
     keys = sorted({key for leaf in leaves for key in leaf})
     differing = [key for key in keys if len({leaf.get(key) for leaf in leaves}) > 1]
-    # Dotted keys by their last part, where no other ends in the same.
+    # Shorten dotted keys to their last part where that is unique.
     last = Counter(key.rpartition(".")[2] for key in differing)
     names = {k: part if last[part := k.rpartition(".")[2]] == 1 else k for k in differing}
     return [
@@ -332,7 +332,6 @@ def _differing(leaves: Sequence[Mapping[str, str]]) -> list[str]:
 def _leaves(value: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
     if isinstance(value, Mapping):
         for key, item in value.items():
-            name = json.dumps(key)[1:-1]  # it may hold whatever JSON can
-            yield from _leaves(item, f"{prefix}.{name}" if prefix else name)
+            yield from _leaves(item, f"{prefix}.{key}" if prefix else key)
     else:
         yield prefix, json.dumps(value)

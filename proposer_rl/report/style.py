@@ -30,7 +30,7 @@ METHODS = {
 # For every other method or variant: Paul Tol's muted scheme without near doubles, with marks.
 FURTHER = ("#332288", "#882255", "#44AA99", "#AA4499", "#999933", "#88CCEE", "#CC6677")
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
-# Lines of matplotlib, and the same for SVG and Plotly: lengths of dashes and gaps.
+# Dashes of matplotlib, and the same as lengths of dashes and gaps for SVG and Plotly.
 DASHES = {"-": "none", "--": "7,4", "-.": "7,3,2,3", ":": "2,3"}
 TURN = 3  # marks further for the next method of a colour
 MARKED = 9  # marks on a line
@@ -50,7 +50,7 @@ SETTINGS: Any = {
     "legend.frameon": False,
     "legend.fontsize": 8,
     "lines.linewidth": 1.8,
-    "text.parse_math": False,  # a dollar sign in a name is no formula
+    "text.parse_math": False,  # a dollar sign in a name begins no formula
     "svg.hashsalt": "proposer_rl",
     "savefig.dpi": DPI,
     "figure.facecolor": "white",
@@ -145,7 +145,7 @@ def render(drawing: Drawing, *suffixes: str) -> list[bytes]:
 def in_few_colours(png: bytes) -> bytes:
     """Returns a PNG in few colours and a third of its size."""
     file = io.BytesIO()
-    # The other ways to choose colours make those of two methods one.
+    # Other algorithms merge the colours of two methods.
     far, plain = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE
     with Image.open(io.BytesIO(png)) as image:
         few = image.convert("RGB").quantize(COLOURS, far, dither=plain)

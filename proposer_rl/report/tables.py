@@ -11,7 +11,7 @@ from typing import Any
 
 from proposer_rl.report.statistics import Interval
 
-# A spreadsheet takes text that begins like this for a formula.
+# Spreadsheets read text that begins with one of these as a formula.
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 Cell = str | int | float | Interval | None
@@ -24,9 +24,9 @@ class Table:
     Attributes:
         name: of its files.
         title: above it.
-        note: what must be known to read it.
-        rows: each from a column's title to the cell; None for an empty one.
-        aside: titles of the columns that are in the CSV alone.
+        note: explains it.
+        rows: mappings from a column's title to the cell, which is None if empty.
+        aside: titles of the columns that only the CSV has.
     """
 
     name: str

@@ -17,8 +17,8 @@ from proposer_rl.runs.folder import read_jsonl
 from proposer_rl.runs.records import LARGEST, Column, Record, batch_shares, printable
 
 COMMON = ("mean_return", "mean_success", "proposed", "told", "dropped", "out")
-# No entries that are curves: counts by bin, the curriculum's own count of them, and what a line is
-# of and where it is.
+# Entries that are not curves: counts by bin, of the teacher and of its curriculum, and the teacher
+# and place of the line.
 ASIDE = ("drawn", "histogram", "teacher", "levels_told")
 MOST_PANELS = 24  # of entries, and of parameters
 MOST_TICKS = 16
@@ -29,8 +29,8 @@ class Log:
     """The lines of a log.
 
     Args:
-        rows: the lines. ``teacher`` says whose each is, and ``levels_told`` how many levels that
-            teacher had been told since it began; without either, they are of one teacher.
+        rows: the lines. ``teacher`` is the teacher of a line, and ``levels_told`` the number of
+            levels told to it since it began; lines without these are of one teacher.
     """
 
     def __init__(self, rows: Sequence[Record]) -> None:
@@ -127,7 +127,7 @@ def read_curves(files: Sequence[Path]) -> Curves:
     """Reads logs and splits them by teacher.
 
     Raises:
-        UnreadableRun: for a file that is no such log.
+        UnreadableRun: for a file that is not such a log.
     """
     logs: dict[str, Log] = {}
     notes = []

@@ -251,7 +251,7 @@ class Task(ABC):
             return torch.zeros(*copies.batch_size, self._actions, device=self.device)
         state = self.evaluation_environment(copies).reset()
         state.update(agent.no_memory(state))
-        logits = agent(state)["logits"]
+        logits = agent(state)[agent.logits_key]
         continuous = agent.distribution_class is normal
         return logits[..., 0] if continuous else logits.softmax(-1).flatten(2)
 

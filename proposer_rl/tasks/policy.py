@@ -211,7 +211,7 @@ def policy_of(task: Task, learner: PPO) -> Policy:
     names = [key for key in agent.in_keys if key not in (BEGINS, *agent.memory)]
     seen = {name: _space(env.observation_spec[name]) for name in names}
     space = seen[NUMBERS_ENTRY] if names == [NUMBERS_ENTRY] else spaces.Dict(seen)
-    return Policy(agent, space, _space(env.full_action_spec["action"]), plain=False)
+    return Policy(agent, space, _space(env.full_action_spec[agent.action_key]), plain=False)
 
 
 def _space(spec: TensorSpec) -> Space:

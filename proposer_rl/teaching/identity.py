@@ -16,12 +16,8 @@ LONGEST = 60  # number of letters of a value in it
 
 def of_levels(space: Any, like: Levels) -> dict[str, Any]:
     """Describes a space or task, and its levels by an example: numbers and texts for JSON."""
-    entries = {
-        ".".join([name] if isinstance(name, str) else name): like.get(name)
-        for name in like.keys(True, True)
-    }
     levels: dict[str, Any] = {
-        name: f"{one.dtype} {list(one.shape)}" for name, one in entries.items()
+        name: f"{one.dtype} {list(one.shape)}" for name, one in like.flatten_keys(".").items()
     }
     levels["number of features"] = level_inputs(space.space, like.unsqueeze(0)).shape[-1]
     known = getattr(space, "description", {"kind": type(space).__qualname__})

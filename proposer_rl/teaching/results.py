@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
 from proposer_rl.curricula import outcome_of
-from proposer_rl.settings import ArgumentError
+from proposer_rl.curricula.contract import outcome_of_episodes
+from proposer_rl.settings import refuse_unknown, within
 from proposer_rl.teaching.numbers import as_numbers
 
 RESULTS = ("return", "success", "score", "episodes", "steps")
@@ -23,12 +24,17 @@ MASK = ("collector", "mask")  # where split_trajectories marks real steps
 ENDS = ("done", "terminated", "truncated", "success")
 
 
-def as_outcome(results: Mapping[str, NDArray[np.float64]]) -> TensorDict:
+def as_outcome(results: Mapping[str, NDArray[Any]]) -> TensorDict:
     """Returns the outcome [m] that curricula observe, from results [m] by name.
 
     NaN means that the loop gave no result: a count is then 1, and another result that one level
-    lacks is left out for all.
+    lacks is left out for all. If all levels have a rollout, the outcome is that of the rollouts.
     """
+    results = dict(results)
+    rollouts = results.pop("rollout").tolist()
+    if all(rollout is not None for rollout in rollouts):
+        played = outcome_of_episodes(rollouts)
+        return played.exclude("success") if np.isnan(results["success"]).any() else played
     outcome = {}
     for name, result in results.items():
         missing = np.isnan(result)
@@ -39,17 +45,21 @@ def as_outcome(results: Mapping[str, NDArray[np.float64]]) -> TensorDict:
     return TensorDict(outcome, outcome["return"].shape)
 
 
-def by_name(outcome: Any) -> dict[str, Any]:
-    """Returns the results of an outcome by name, or only its rollout if it has one.
+def results_of(outcome: Any, rule: Any) -> dict[str, Any]:
+    """Returns the results of an outcome by name, or those of its rollout if it has one.
+
+    Args:
+        outcome: results by name.
+        rule: as of :func:`results_of_rollout`.
 
     Raises:
         ArgumentError: for an unknown name.
     """
     names = [*outcome.keys()]
     if "rollout" in names:
-        return {"rollout": outcome["rollout"]}
-    if unknown := [name for name in names if name not in RESULTS]:
-        raise ArgumentError(f"outcome.{unknown[0]}: unknown; there are: {', '.join(RESULTS)}")
+        return results_of_rollout(outcome["rollout"], rule)
+    with within("outcome"):
+        refuse_unknown(names, RESULTS)
     return {name: outcome[name] for name in names}
 
 

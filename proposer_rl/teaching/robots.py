@@ -52,7 +52,7 @@ class LevelTerm:
     def __init__(self, cfg: Any, env: Any) -> None:
         self.cfg, self.env, self._env = cfg, env, env  # ManagerTermBase reads _env
         self.teacher = self.make_teacher()
-        self.teacher.diverge(_rank())
+        self._diverge()
         self.tickets = torch.full((env.num_envs,), NONE, device=env.device)
         self._begun = torch.zeros_like(self.tickets)  # common_step_counter at their reset
         self._levels: Any = None
@@ -102,7 +102,9 @@ class LevelTerm:
                 self._levels = levels.new_zeros(env.num_envs, *levels.shape[1:])
         self._levels[ids] = levels
         self.set_levels(ids, levels)
-        return _means(self._levels[self.tickets != NONE])
+        played = self._levels[self.tickets != NONE]
+        named = played.items() if is_tensor_collection(played) else [("level", played)]
+        return {str(name): entry.float().mean() for name, entry in named}
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the state of the teacher."""
@@ -117,7 +119,10 @@ class LevelTerm:
         self.tickets.fill_(NONE)
         self.teacher.load_state_dict(state)
         self.teacher.drop()  # the levels that the environments of the saved state played
-        self.teacher.diverge(_rank())
+        self._diverge()
+
+    def _diverge(self) -> None:
+        self.teacher.diverge(int(os.environ.get("RANK", "0")))
 
 
 class TaughtRunner:
@@ -166,13 +171,3 @@ class TaughtRunner:
         for term, state in zip(self._terms, saved, strict=False):
             term.load_state_dict(state)
         return infos
-
-
-def _rank() -> int:
-    return int(os.environ.get("RANK", "0"))
-
-
-def _means(levels: Any) -> dict[str, Tensor]:
-    """Returns the mean of each parameter of levels [n]."""
-    named = levels.items() if is_tensor_collection(levels) else [("level", levels)]
-    return {str(name): entry.float().mean() for name, entry in named}

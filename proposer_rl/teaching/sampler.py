@@ -34,6 +34,12 @@ class Answer(NamedTuple):
     episodes: float = 1
 
 
+def _mean(answers: list[Answer]) -> Answer:
+    episodes = sum(one.episodes for one in answers)
+    success = sum(one.success * one.episodes for one in answers) / episodes
+    return Answer(success, sum(one.return_ * one.episodes for one in answers) / episodes, episodes)
+
+
 @dataclass
 class Epoch:
     """The items drawn in an epoch, and the number given to the loop, with repetitions."""
@@ -85,7 +91,7 @@ class TeacherSampler(Sampler[int]):
         self._asked, self._trace = 0, 0  # number of items since the start, and their checksum
         self._check: float = 0  # number of items at which to look for missing results again
         self._sources = sources
-        self._sums: dict[str, list[float]] = {}  # since the last metrics(), in all and by source
+        self._sums: dict[str, tuple[float, int]] = {}  # with their counts, since metrics()
 
     def __len__(self) -> int:
         return self._length * self._repeat * self._rounds
@@ -152,14 +158,10 @@ class TeacherSampler(Sampler[int]):
         between 0 and 1; ``no_variance``, the share of the others; and the same by source, as
         ``yield/SOURCE``. Empty if there was no group.
         """
-        shown: dict[str, float] = {}
-        for of, (groups, success, mixed, predicted, known) in self._sums.items():
-            shown |= {f"success{of}": success / groups, f"yield{of}": mixed / groups}
-            shown[f"no_variance{of}"] = 1 - mixed / groups
-            if known:
-                shown[f"predicted{of}"] = predicted / known
+        means = {name: total / number for name, (total, number) in self._sums.items()}
         self._sums = {}
-        return shown
+        mixed = [name for name in means if name.startswith("yield")]
+        return means | {f"no_variance{name[5:]}": 1 - means[name] for name in mixed}
 
     def state_dict(self) -> dict[str, Any]:
         """Returns what is out and the place in the epoch, without the teacher's state."""
@@ -212,10 +214,7 @@ class TeacherSampler(Sampler[int]):
         came: dict[int, list[Answer | None]] = {}
         for item, answer in _everywhere(read, self._trace):
             came.setdefault(item, list(self._came.get(item, ()))).append(answer)
-        whole: list[tuple[int, float, float, float]] = []
-        groups: list[tuple[int, list[Answer]]] = []  # the answers of each of them
-        dropped: list[int] = []
-        over: list[tuple[int, int]] = []  # items, and how many of their tickets
+        groups: list[tuple[int, int, list[Answer]]] = []  # a ticket, its item, and the answers
         for item, answers in came.items():
             tickets = self._out.get(item, [])
             if len(answers) > len(tickets) * self._repeat:
@@ -223,44 +222,33 @@ class TeacherSampler(Sampler[int]):
                     f"items={item}: {len(answers)} answers, but only {len(tickets) * self._repeat} "
                     "are out"
                 )
-            full = len(answers) // self._repeat
-            for ticket in tickets[:full]:
+            for ticket in tickets[: len(answers) // self._repeat]:
                 group, answers[:] = answers[: self._repeat], answers[self._repeat :]
-                if results := [Answer(*answer) for answer in group if answer]:
-                    episodes = sum(one.episodes for one in results)
-                    return_ = sum(one.return_ * one.episodes for one in results) / episodes
-                    success = sum(one.success * one.episodes for one in results) / episodes
-                    whole.append((ticket, return_, success, episodes))
-                    groups.append((item, results))
-                else:
-                    dropped.append(ticket)
-            over.append((item, full))
-        if whole:
-            ids, returns, successes, counts = zip(*whole, strict=True)
-            predicted = self._teacher.predicted([*ids])
-            self._teacher.tell([*ids], returns, successes, episodes=counts)
-            for place, (item, results) in enumerate(groups):
-                expected = None if predicted is None else float(predicted[place])
-                self._sum(item, successes[place], results, expected)
-        self._teacher.drop(dropped)
-        for item, full in over:
-            del self._out[item][:full]
-        self._came.update(came)
-        for item in [item for item in came if not came[item]]:
-            del self._came[item]
+                groups.append((ticket, item, [one for one in group if one]))
+        told = [ticket for ticket, _, results in groups if results]
+        if told:
+            whole = [(item, results) for _, item, results in groups if results]
+            successes, returns, counts = zip(*(_mean(results) for _, results in whole), strict=True)
+            predicted = self._teacher.predicted(told)
+            self._teacher.tell(told, returns, successes, episodes=counts)
+            for place, (item, results) in enumerate(whole):
+                seen = {one.success for one in results}
+                mixed = any(one.episodes > 1 and 0 < one.success < 1 for one in results)
+                self._add(item, "success", successes[place])
+                self._add(item, "yield", mixed or len(seen) > 1)
+                if predicted is not None:
+                    self._add(item, "predicted", float(predicted[place]))
+        self._teacher.drop([ticket for ticket, _, results in groups if not results])
+        for ticket, item, _ in groups:
+            self._out[item].remove(ticket)
+        self._came = {item: some for item, some in {**self._came, **came}.items() if some}
         self._look()
 
-    def _sum(
-        self, item: int, success: float, results: list[Answer], predicted: float | None
-    ) -> None:
-        """Adds a group to the metrics."""
-        seen = {one.success for one in results}
-        mixed = len(seen) > 1 or any(one.episodes > 1 and 0 < one.success < 1 for one in results)
-        known = predicted is not None
-        for of in [""] if self._sources is None else ["", f"/{self._sources[item]}"]:
-            sums = self._sums.setdefault(of, [0.0] * 5)
-            for place, value in enumerate((1, success, mixed, predicted or 0, known)):
-                sums[place] += value
+    def _add(self, item: int, name: str, value: float) -> None:
+        """Adds a number of a group to the metrics."""
+        for of in ("",) if self._sources is None else ("", f"/{self._sources[item]}"):
+            total, number = self._sums.get(name + of, (0.0, 0))
+            self._sums[name + of] = total + value, number + 1
 
     def _look(self) -> None:
         """Warns once if results of most items never come, when few can still be on their way."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,7 +19,7 @@ from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from torch import Tensor
 
 from proposer_rl.models import check_torch_defaults
-from proposer_rl.settings import ArgumentError, plain, shown, whole
+from proposer_rl.settings import ArgumentError, plain, refuse_unknown, shown, whole, within
 from proposer_rl.task import Distribution, Levels, space_features
 from proposer_rl.tasks.parameters import Bins, Law, ParameterSpace
 from proposer_rl.tasks.ranges import (
@@ -117,9 +118,6 @@ class Parameters(LevelSpace, ParameterSpace):
         named: further distributions like ``target``, by name, for hand-designed curricula.
         seeded: whether each level has a ``seed``, a whole number to reset its episodes with.
 
-    Attributes:
-        labels: the choices of each parameter that has texts, by name; None for the others.
-
     Raises:
         ArgumentError: naming the parameter, for something that is no range or not within it.
         ValueError: if the combinations of the parameters' bins are too many to be numbered.
@@ -142,7 +140,8 @@ class Parameters(LevelSpace, ParameterSpace):
     ) -> None:
         check_torch_defaults()
         named_bins = bins if isinstance(bins, Mapping) else {}
-        _check_names("bins", named_bins, ranges)
+        with within("bins"):
+            refuse_unknown(named_bins, ranges)
         counts = dict.fromkeys(ranges, 8 if bins is named_bins else whole("bins", bins, 1))
         counts |= {name: whole(f"bins.{name}", count, 1) for name, count in named_bins.items()}
         ranges = {name: python_values(given) for name, given in ranges.items()}
@@ -155,9 +154,7 @@ class Parameters(LevelSpace, ParameterSpace):
             name: read_line(f"ranges.{name}", given, counts[name]) for name, given in ranges.items()
         }
         super().__init__(parts, seeded)
-        self.labels = {name: getattr(part, "labels", None) for name, part in parts.items()}
         if in_file:
-            _check_names("target", target or {}, parts)
             read = {name: target_in_file(one, parts[name]) for name, one in in_file.items()}
             target = {**read, **(target or {})}
         said = _distributions(target, named)
@@ -212,7 +209,8 @@ class Parameters(LevelSpace, ParameterSpace):
 
     def _part(self, key: str, ranges: Ranges) -> dict[str, Bins]:
         """Returns the bins of a part of the space, by parameter."""
-        _check_names(key, ranges, self.bins)
+        with within(key):
+            refuse_unknown(ranges, self.bins)
         parts = dict(self.bins)
         for name, given in ranges.items():
             where, line = f"{key}.{name}", self.bins[name]
@@ -286,9 +284,7 @@ class MadeLevels(Parameters):
         """Returns levels [*B] as the function made them."""
         return levels[DRAWN]
 
-    def rows(self, levels: TensorDictBase) -> list[Any]:
-        """Returns levels [n] as a list."""
-        return LevelSpace.rows(self, levels)
+    rows = LevelSpace.rows
 
     def at(self, points: Tensor, generators: Sequence[torch.Generator]) -> TensorDict:
         """Makes levels [K, P] at points of the box that the ranges span."""
@@ -378,23 +374,25 @@ class Items(LevelSpace):
         self._inputs = torch.cat([known, columns], 1)
         low, high = lines.amin(0), lines.amax(0)
         self.coordinates = (2 * (lines - low) / (high - low).clamp_min(1e-12) - 1).float()
-        self._parts = {
-            name: _SomeItems(torch.from_numpy(as_ids(name, given, count)))
+        self._places = {
+            name: torch.from_numpy(as_ids(name, given, count))
             for name, given in _distributions(target, named).items()
         }
-        self.distributions = {"all": self, **self._parts}
+        parts = {name: _Drawn(partial(_among, one)) for name, one in self._places.items()}
+        self.distributions = {"all": self, **parts}
 
     @property
     def target_shares(self) -> Tensor:
         """Returns the shares of the target in each item, float [N]."""
-        places: Any = self.target
-        return places.places.bincount(minlength=self.size) / len(places.places)
+        self.target  # noqa: B018  which must be there
+        places = self._places["target"]
+        return places.bincount(minlength=self.size) / len(places)
 
     @property
     def description(self) -> dict[str, Any]:
         """Describes the items: their number, a hash of their features, the target's places."""
         rates = {} if self.pass_rates is None else {"pass_rates": _hash(self.pass_rates)}
-        places = {name: one.places.tolist() for name, one in self._parts.items()}
+        places = {name: one.tolist() for name, one in self._places.items()}
         return {
             **super().description,
             "count": self.size,
@@ -437,13 +435,10 @@ class Items(LevelSpace):
         return places
 
 
-class _SomeItems:
-    def __init__(self, places: Tensor) -> None:
-        self.places = places
-
-    def sample(self, count: int, generator: torch.Generator) -> TensorDict:
-        which = torch.randint(len(self.places), (count,), generator=generator)
-        return TensorDict({"item": self.places[which]}, [count])
+def _among(places: Tensor, count: int, generator: torch.Generator) -> TensorDict:
+    """Draws some of the items at places."""
+    which = torch.randint(len(places), (count,), generator=generator)
+    return TensorDict({"item": places[which]}, [count])
 
 
 class LevelGenerator(LevelSpace):
@@ -473,7 +468,7 @@ class LevelGenerator(LevelSpace):
         functions = {"all": draw, **_distributions(target, named)}
         self.distributions = {name: _Drawn(function) for name, function in functions.items()}
         if edit is not None:
-            self.edit = self._edits(edit)
+            self.edit = partial(self._edited, edit)
 
     def sample(self, count: int, generator: torch.Generator) -> Levels:
         """Draws levels [count]."""
@@ -497,13 +492,11 @@ class LevelGenerator(LevelSpace):
 
     size = coordinates = generate = target_shares = axes
 
-    def _edits(self, edit: Callable[[Any, int, torch.Generator], Any]) -> Callable[..., Levels]:
-        def edited(levels: Levels, count: int, generators: Sequence[torch.Generator]) -> Levels:
-            rows = zip(levels, generators, strict=True)
-            made = [(edit(self.given(own), count, g), len(own)) for own, g in rows]
-            return torch.stack([_taken(new, n) for new, n in made])
-
-        return edited
+    def _edited(
+        self, edit: Any, levels: Levels, count: int, generators: Sequence[torch.Generator]
+    ) -> Levels:
+        rows = zip(levels, generators, strict=True)
+        return torch.stack([_taken(edit(self.given(own), count, g), len(own)) for own, g in rows])
 
 
 class _Drawn:
@@ -540,9 +533,3 @@ def _hash(numbers: Tensor) -> str:
 def _distributions(target: T | None, named: Mapping[str, T] | None) -> dict[str, T]:
     """Returns the distributions beside the space itself, by name."""
     return {**({} if target is None else {"target": target}), **(named or {})}
-
-
-def _check_names(key: str, given: Mapping[str, Any], known: Mapping[str, Any]) -> None:
-    unknown = [name for name in given if name not in known]
-    if unknown:
-        raise ArgumentError(f"{key}.{unknown[0]}: unknown; there are: {', '.join(known)}")

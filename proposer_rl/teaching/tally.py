@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -24,14 +25,13 @@ class Tally:
     """
 
     def __init__(self, space: Any) -> None:
-        self._space = space.space
-        self._texts = _bin_texts(self._space)
+        self._texts, self._bins = _bins(space.space)
         self._clear()
 
     def count(self, levels: Levels) -> None:
         """Counts levels [n] that were handed out."""
         self._proposed += len(levels)
-        for name, bins in self._bins(levels).items() if self._texts else ():
+        for name, bins in self._bins(levels).items():
             self._drawn[name] += bins.bincount(minlength=len(self._texts[name]))
 
     def returned(self, tickets: int, returns: Any, success: Any = None) -> None:
@@ -75,37 +75,32 @@ class Tally:
             name: torch.zeros(len(t), dtype=torch.int64) for name, t in self._texts.items()
         }
 
-    def _bins(self, levels: Levels) -> dict[str, Tensor]:
-        """Returns the bin of each of levels [*B] along each axis, int64 [n] by its name."""
-        space = self._space
-        if isinstance(space, ParameterSpace):
-            return {
-                name: torch.searchsorted(part.borders, levels[name].double().flatten().cpu())
-                for name, part in space.bins.items()
-            }
-        if isinstance(space, Items):
-            parts = _parts(space)
-            items = levels["item"].cpu().flatten()
-            return {"item": (items * parts // space.size).clamp(0, parts - 1)}
-        places, own = space.coordinates.double(), space.locate(levels).cpu().double()
-        nearest = torch.cdist(own.flatten(0, -2), places).argmin(-1)
-        sizes = [len(values) for values in space.axes.values()]
-        return dict(zip(space.axes, torch.unravel_index(nearest, sizes), strict=True))
 
+def _bins(space: Any) -> tuple[dict[str, list[str]], Callable[[Levels], dict[str, Tensor]]]:
+    """Returns the names of the bins along each axis, and a function that finds levels in them.
 
-def _bin_texts(space: Any) -> dict[str, list[str]]:
-    """Returns the names of the bins of each axis; nothing if there are no bins."""
+    The function returns for levels [n] the bin along each axis, int64 [n]. There is no axis if the
+    space has no bins.
+    """
     if isinstance(space, ParameterSpace):
-        return {name: part.texts for name, part in space.bins.items()}
+        return {name: part.texts for name, part in space.bins.items()}, lambda levels: {
+            name: torch.searchsorted(part.borders, levels[name].double().cpu())
+            for name, part in space.bins.items()
+        }
     if isinstance(space, Items):
-        parts = _parts(space)
+        parts = min(space.size, MOST_PARTS)
         ends = [-(-space.size * part // parts) for part in range(parts + 1)]
-        pairs = [(low, high - 1) for low, high in pairwise(ends)]
-        return {"item": [f"{a}" if a == b else f"{a} to {b}" for a, b in pairs]}
+        texts = [f"{a}" if b - a == 1 else f"{a} to {b - 1}" for a, b in pairwise(ends)]
+        return {"item": texts}, lambda levels: {
+            "item": (levels["item"].cpu() * parts // space.size).clamp(0, parts - 1)
+        }
     if not hasattr(type(space), "locate") or space.size > MOST_BINS:
-        return {}
-    return {name: [f"{value:g}" for value in values] for name, values in space.axes.items()}
+        return {}, lambda levels: {}
+    names = {name: [f"{value:g}" for value in values] for name, values in space.axes.items()}
+    sizes = [*map(len, names.values())]
 
+    def nearest(levels: Levels) -> dict[str, Tensor]:
+        distances = torch.cdist(space.locate(levels).cpu().double(), space.coordinates.double())
+        return dict(zip(names, torch.unravel_index(distances.argmin(-1), sizes), strict=True))
 
-def _parts(space: Items) -> int:
-    return min(space.size, MOST_PARTS)
+    return names, nearest

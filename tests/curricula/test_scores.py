@@ -13,7 +13,6 @@ from torch import Tensor
 
 from proposer_rl.curricula import Student, TaskStudent, outcome_of
 from proposer_rl.curricula.scores import STEPWISE, Scorer, episodes, unseen
-from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
 from tests.tiny import TASK, evaluate, learners
 
@@ -252,6 +251,9 @@ def test_a_score_of_ones_own_is_what_its_function_says_of_the_outcome(own: Any) 
     assert float(found.best) == pytest.approx(0.99)
 
 
+NUMBERS = r"must return a tensor \[1\] without NaN"
+
+
 @pytest.mark.parametrize(
     ("score", "source", "message"),
     [
@@ -261,16 +263,11 @@ def test_a_score_of_ones_own_is_what_its_function_says_of_the_outcome(own: Any) 
         (f"{__name__}.luck", "episodes", "has no attribute 'luck'"),
         (shortfall, "exact", "score=shortfall: a function of your own needs source=episodes"),
         (3, "episodes", "score=3: input should be a valid string, or callable"),
+        (lambda *_: torch.ones(3), "episodes", NUMBERS),
+        (lambda *_: 1.0, "episodes", NUMBERS),
+        (lambda *_: torch.full((1,), torch.nan), "episodes", NUMBERS),
     ],
 )
 def test_what_is_no_score_is_refused(score: Any, source: Any, message: str) -> None:
-    with pytest.raises(ArgumentError, match=message):
-        Scorer(score, source)
-
-
-@pytest.mark.parametrize(
-    "wrong", [lambda *_: torch.ones(3), lambda *_: 1.0, lambda *_: torch.full((1,), torch.nan)]
-)
-def test_what_is_no_number_for_each_level_is_refused(wrong: Any) -> None:
-    with pytest.raises(ValueError, match=r"must return a tensor \[1\] without NaN"):
-        Scorer(wrong, "episodes").of_outcome(LEARNER, outcome_of(played(FIRST)), NONE, NONE)
+    with pytest.raises(ValueError, match=message):
+        Scorer(score, source).of_outcome(LEARNER, outcome_of(played(FIRST)), NONE, NONE)

@@ -11,17 +11,20 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torch.distributions import Categorical
 from torch.nn.functional import smooth_l1_loss
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
+from torchrl.envs import RenameTransform, TransformedEnv
 from torchrl.objectives import A2CLoss, ReinforceLoss
 
 from proposer_rl.learning import PPO, LeaveOneOutBaseline, MakeLoss, PPOSettings
 from proposer_rl.learning.objective import clip_gradients_
 from proposer_rl.learning.ppo import complete_adam
-from proposer_rl.models import Population, UNet, map_actor_critic
+from proposer_rl.models import ActorCritic, Population, UNet, map_actor_critic
+from proposer_rl.models.grids import read_maps
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.mazes import Level, MazeEnv, generate_levels
 from proposer_rl.tasks.view_mazes.view_env import ViewMazeEnv
@@ -236,6 +239,37 @@ def test_restore_refuses_what_does_not_fit() -> None:
             ppo.restore(bad)
     with pytest.raises(ValueError, match="different numbers of Adam steps"):
         ppo.restore(late)
+
+
+def test_entries_may_have_other_names() -> None:
+    """Where an environment and a network call things otherwise, the same is learnt."""
+    env = TransformedEnv(
+        MazeEnv(levels(2), max_steps=5), RenameTransform([], [], ["action"], ["move"])
+    )
+    torch.manual_seed(3)
+    usual = learner(2)
+    maps = usual.agent.encoder
+    renamed = PPO(
+        env,
+        ActorCritic(
+            TensorDictModule(read_maps, [*maps.out_keys, "agent"], ["scores", "worth"]),
+            copy.deepcopy(maps),
+            distribution_class=usual.agent.distribution_class,
+            copies=2,
+            action_key="move",
+            log_prob_key="log_prob",
+            logits_key="scores",
+            value_key="worth",
+        ),
+        SETTINGS,
+    )
+    (expected, metrics), (rollout, also) = (
+        ppo.update(generators(0, 1)) for ppo in (usual, renamed)
+    )
+    names = {"move": "action", "log_prob": "action_log_prob", "worth": "state_value"}
+    for key in (*names, "advantage", "value_target"):
+        assert torch.equal(rollout[key], expected[names.get(key, key)]), key
+    assert (also == metrics).all()
 
 
 def test_a_single_transition_is_not_standardised() -> None:

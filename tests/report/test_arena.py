@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +91,11 @@ def test_each_method_is_beside_the_baseline_in_the_mean_over_tasks(runs: Path) -
     assert target.difference.estimate == pytest.approx(-0.15) and target.verdict != "–"
     assert (plr.frames, plr.seconds) == (1, 1) and uniform.decision is None
     assert (plr.worst, plr.reached) == ("−0.100 arena/b", "0 of 2")
+    # Four of its five seeds get to 0.55 on the one task, and two on the other.
+    lower = {task: replace(study, threshold=0.55) for task, study in compared.tasks.items()}
+    plr, uniform, target = Arena(lower, compared.baselines).rows
+    assert [row.reached for row in (plr, uniform, target)] == ["1 of 2", "1 of 2", "0 of 2"]
+    assert "threshold on 1 of them, where domain_randomization does on 1, at 1× the" in plr.says
 
 
 def test_every_task_has_the_differences_to_each_baseline(runs: Path) -> None:

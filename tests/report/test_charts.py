@@ -16,7 +16,6 @@ from PIL import Image
 
 from proposer_rl.report import build, page
 from proposer_rl.report.build import write_report
-from proposer_rl.report.charts import charts
 from proposer_rl.report.figures import learning_curves
 from proposer_rl.report.measures import own_numbers
 from proposer_rl.report.studies import read_studies
@@ -170,16 +169,6 @@ def test_stages_move_proposals_levels_and_success_together(tmp_path: Path) -> No
     alone = data["stages"]["methods"][0]["stages"]
     assert [stage["map"] and stage["map"][0][0] for stage in alone] == [1, 0]
     assert [(stage["updates"], stage["levels"]) for stage in alone] == [(0, []), (20, [])]
-
-
-def test_cycles_of_no_seed_that_is_there_are_no_stages(tmp_path: Path) -> None:
-    strangers = [{"updates": 0, "seed": 9, "histogram": [[1, 1, 1], [1, 1, 1]]}]
-    for name in ("a", "b"):
-        (write_run(tmp_path / name, name, cycles=strangers) / "curriculum.jsonl").unlink()
-    write_run(tmp_path / "c", "c")  # with levels
-    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
-    stages = charts(study)["stages"]["methods"]
-    assert [method and method["seed"] for method in stages] == [None, None, 0]
 
 
 def test_methods_keep_their_colours_in_still_figures(runs: Path) -> None:

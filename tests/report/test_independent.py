@@ -122,6 +122,10 @@ def check(metrics: pd.DataFrame, methods: pd.DataFrame, pairs: pd.DataFrame, rel
     assert len(pairs) == len(expected_pairs) * len(runs.columns)
     table = found.merge(pairs, on=["outcome", "first", "second"], validate="one_to_one")
     assert len(table) == len(found)
+    assert table.loc[~primary, "verdict"].isna().all()
+    few = [len(of[one]) < FEWEST or len(of[other]) < FEWEST for one, other in expected_pairs]
+    verdicts = pairs.loc[pairs["outcome"] == runs.columns[0], "verdict"]
+    assert (verdicts == "too few seeds").tolist() == few
     for _, row in table.iterrows():
         shown = [row["difference"], row["difference, low"], row["difference, high"]]
         assert shown == pytest.approx([row["value"], row["low"], row["high"]], **near)

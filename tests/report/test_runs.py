@@ -85,13 +85,6 @@ def test_runs_of_a_sweep_come_in_the_order_of_their_numbers(tmp_path: Path) -> N
     assert [path.name for path in begun(tmp_path)] == ordered
 
 
-@pytest.mark.parametrize("name", ["missing", "empty"])
-def test_a_wrong_folder_is_named(name: str, tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(UnreadableRun, match=name):
-        find_runs([tmp_path / name])
-
-
 def replaced(old: str, new: str):
     return lambda text: text.replace(old, new)
 

@@ -253,14 +253,6 @@ def test_variants_are_called_by_what_differs_on_their_command_lines(tmp_path: Pa
     assert labels(study) == {"mine": [0, 1], "mine, filter=learnability": [0, 1]}
 
 
-def test_a_label_is_one_line_whatever_settings_are_called(tmp_path: Path) -> None:
-    for i in range(2):
-        write_run(tmp_path / str(i), facts={"overrides": None}, solver={"a\n```\n": i})
-    (study,), _ = read(tmp_path)
-    assert len(study.groups) == 2
-    assert all(line.isprintable() for line in [*labels(study), *commands(study)])
-
-
 def test_seeds_trained_together_have_one_curriculum(tmp_path: Path) -> None:
     """Its cycles would else count once for every seed, and an interval be of nothing."""
     write_run(tmp_path / "a", "plr", [0, 1], cycles=[{"updates": 0, "score": 1}])

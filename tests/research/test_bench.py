@@ -25,9 +25,8 @@ from research.benchmarks.gymnasium import Trained, read_rows, write_rows
 from research.benchmarks.memory import peak_memory
 from research.benchmarks.plain import PlainPPO, PlainUNet
 from research.benchmarks.plain_env import PlainMaze
-from research.benchmarks.profiling import kind_of
-from research.benchmarks.registry import BENCHMARKS, measure, selected
-from research.benchmarks.report import number, summary
+from research.benchmarks.registry import BENCHMARKS, measure
+from research.benchmarks.report import summary
 from research.benchmarks.results import Options, Result, Row, Spread
 from research.benchmarks.scales import PAPER, QUICK, TINY, Solvers
 from research.benchmarks.timing import interleave, ratio, threads
@@ -106,12 +105,6 @@ def test_memory_is_a_process_s_own_and_not_that_of_the_one_which_started_it() ->
     assert 0.9 * 2**26 < after - before < 2**27
 
 
-def test_lists_the_benchmarks(bench, capsys) -> None:
-    assert bench("--list") == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == list(BENCHMARKS)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -148,7 +141,7 @@ def test_runs_that_cannot_be_timed_get_one_line(bench, capsys, tmp_path: Path) -
         ("levels", "--runs", "two"): "is for the benchmark curricula, not for levels",
         ("curricula", "--runs", "nowhere"): "nowhere: there is no such folder",
         ("curricula", "--runs", "alone"): "the runs are of one method",
-        ("curricula", "--runs", "two"): "does not hold the settings of a run",
+        ("curricula", "--runs", "two"): "not the settings of a run",
     }.items():
         assert bench(*arguments) == 2
         (line,) = capsys.readouterr().err.splitlines()
@@ -173,15 +166,6 @@ def test_what_was_trained_before_is_not_trained_again(tmp_path: Path) -> None:
     assert result.tables[0].lines[0][:6] == ["CartPole-v1", "proposer_rl", "2", "500", "407.5 ± 0.7", "407.0"]  # fmt: skip  # noqa: E501
     write_rows(file, rows)
     assert measure("gymnasium", options).rows[0].value.median == 0.5
-
-
-def test_long_benchmarks_run_on_request() -> None:
-    assert "learning" not in selected([], full=True)
-    assert "memory" in selected([], full=True)
-    assert not {"memory", "learning", "gymnasium"} & set(selected([], full=False))
-    assert selected(["learning"], full=False) == ["learning"]
-    assert "gpu" in selected([], full=False, cuda=True)
-    assert "gpu" not in selected([], full=True)
 
 
 def test_what_is_measured_is_what_a_run_would_be() -> None:
@@ -277,26 +261,3 @@ def test_interleaving_alternates_and_pairs_rounds() -> None:
 def test_a_row_says_whether_its_target_is_reached(value, at_most, reached) -> None:
     row = Row("this", "that", Spread.of([value]), "x", target=2.0, at_most=at_most)
     assert summary([Result([row])]).splitlines()[-1].split("|")[-2].strip() == reached
-
-
-@pytest.mark.parametrize(
-    ("value", "shown"), [(208.4, "208x"), (-12.34, "-12.3x"), (0.1, "0.10x"), (0.0134, "0.013x")]
-)
-def test_a_ratio_is_shown_to_two_or_three_figures(value: float, shown: str) -> None:
-    assert number(value, "x") == shown
-
-
-@pytest.mark.parametrize(
-    ("operation", "kind"),
-    [
-        ("mkldnn_convolution", "convolution"),
-        ("native_group_norm_backward", "normalisation"),
-        ("linalg_vector_norm", "optimiser and gradient norm"),
-        ("Optimizer.step#Adam.step", "optimiser and gradient norm"),
-        ("bmm", "upsampling and matrix products"),
-        ("cat", "copies, casts, concatenation"),
-        ("scatter_", "other operations"),
-    ],
-)
-def test_kinds_of_operations(operation: str, kind: str) -> None:
-    assert kind_of(operation) == kind

@@ -432,7 +432,7 @@ def test_runs_that_were_not_measured_alike_are_refused(runs: Path, tmp_path: Pat
     (tmp_path / "mine" / "index.md").write_text("mine")
     wrong = {
         "were not measured alike": [str(tmp_path / "rockets"), str(runs), "-o", "new"],
-        f"but no {CHOICE}": [str(runs), "-o", str(tmp_path / "mine")],
+        f"and has no {CHOICE}": [str(runs), "-o", str(tmp_path / "mine")],
         "--baseline=nobody: must be one of": [str(runs), "--baseline=nobody", "-o", "new"],
         "--threshold=80: must be above 0": [str(runs), "--threshold=80", "-o", "new"],
     }

@@ -55,6 +55,15 @@ def through_torch(state: Any) -> Any:
     return torch.load(file, weights_only=True)
 
 
+def rollout(rewards: Any, ends: bool = True, **entries: Any) -> TensorDict:
+    """A rollout [n, T] of rewards, whose episodes end with the last step or not yet."""
+    rewards = torch.as_tensor(rewards)
+    done = torch.zeros(*rewards.shape, 1, dtype=torch.bool)
+    done[:, -1] = ends
+    after = {"reward": rewards.unsqueeze(-1), "done": done, "terminated": done}
+    return TensorDict({"next": after, **entries}, rewards.shape)
+
+
 def counted(*reads: str, **how: Any) -> Any:
     """A teacher of numbers, whose curriculum notes what came of each."""
     return prl.Teacher(Counting(*reads), ITEMS, **how)

@@ -171,13 +171,14 @@ def paying(reward: Any) -> gymnasium.Env[Any, Any]:
 @pytest.mark.parametrize(
     ("env", "more", "message"),
     [
-        (paying(np.nan), {}, "return_=nan: must be finite"),
+        (paying(np.nan), {"success": "terminated"}, "return_=nan: must be finite"),
         (paying(1.0), {"success": "won"}, "success='won': .* its entries: terminated, truncated$"),
         (paying(1.0), {"success": lambda last: None}, "success=.*, or the function returned None"),
+        (paying(1.0), {}, "success=None: the last info .* does not"),
     ],
 )
 def test_what_a_step_must_not_answer(env: Any, more: Any, message: str) -> None:
-    teacher = counted()
+    teacher = counted("success")
     env = prl.TaughtEnv(env, teacher, set_level, **more)
     env.reset()
     with pytest.raises(ArgumentError, match=message) as refused:
@@ -266,12 +267,6 @@ def test_a_success_may_be_of_any_step(once: bool) -> None:
     play(env, 8)
     for number, (_, success) in seen(teacher).items():
         assert success == (number % (2 if once else 4) == 0)
-
-
-def test_success_is_asked_for_where_nothing_says_it() -> None:
-    env = cartpole({"gravity": "gravity"}, recipe=PROGRESS)
-    with pytest.raises(ArgumentError, match=r"success=None: the last info .* does not"):
-        play(env, 1)
 
 
 def test_stable_baselines_logs_what_the_teacher_tells(tmp_path: Any) -> None:

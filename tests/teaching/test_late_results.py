@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 from torch.utils._pytree import tree_map_only
 
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
 from tests.curricula.test_contract import same
-from tests.teaching.counting import ITEMS, Counting, through_torch
+from tests.teaching.counting import ITEMS, Counting, rollout, through_torch
 
 SPACE = prl.Parameters({"force": (0.5, 4.5)}, bins=4, target={"force": 4.5})
 
@@ -25,11 +24,8 @@ def test_an_episode_may_be_longer_than_rollouts(resumed: bool) -> None:
     teacher = prl.Teacher(curriculum, ITEMS)
     ids, _ = teacher.ask(1)
     for steps in (4, 4, 2):
-        done = torch.zeros(1, steps, 1, dtype=torch.bool)
-        done[0, -1] = steps == 2
-        after = {"reward": torch.ones(1, steps, 1), "done": done, "terminated": done}
         level = ids.expand(1, steps).unsqueeze(-1)
-        teacher.observe(TensorDict({"level_id": level, "next": after}, [1, steps]))
+        teacher.observe(rollout(torch.ones(1, steps), ends=steps == 2, level_id=level))
         if resumed:
             state = through_torch(teacher.state_dict())
             teacher = prl.Teacher(curriculum, ITEMS)
@@ -118,20 +114,14 @@ def test_tickets_that_are_never_told_keep_their_own_blocks_alone() -> None:
     }
 
 
-def test_batches_that_are_dropped_are_observed_no_more() -> None:
-    teacher = prl.Teacher(Counting(), ITEMS)
-    teacher.propose(4)
-    teacher.drop()
-    with pytest.raises(ArgumentError, match="ids: missing: nothing is out"):
-        teacher.observe({"return": [0.0] * 4})
-    teacher.propose(2)
-    teacher.observe({"return": [0.0] * 2})
-
-
-def test_batches_whose_tickets_are_over_are_not_waited_for() -> None:
+@pytest.mark.parametrize("dropped", [True, False])
+def test_batches_whose_tickets_are_over_are_not_waited_for(dropped: bool) -> None:
     teacher = prl.Teacher(Counting(), ITEMS, block=8)
     teacher.propose(4)
-    teacher.tell(range(4), [0.0] * 4)
+    if dropped:
+        teacher.drop()
+    else:
+        teacher.tell(range(4), [0.0] * 4)
     teacher.ask()  # takes in what was told, so that the batch is forgotten
     with pytest.raises(ArgumentError, match="ids: missing: nothing is out"):
         teacher.observe({"return": [0.0] * 4})

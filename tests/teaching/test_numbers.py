@@ -27,7 +27,7 @@ from proposer_rl.curricula.belief import WIDEST
 from proposer_rl.settings import ArgumentError
 from proposer_rl.tasks.ranges import RangeSettings, spaces
 from proposer_rl.teaching.tables import few_columns, ranks
-from tests.teaching.counting import Counting
+from tests.teaching.counting import Counting, rollout
 
 NAN, INF, HUGE = float("nan"), float("inf"), 1e39  # finite in float64, not in float32
 LINE = prl.Parameters({"s": (0.0, 1.0)}, bins=2)
@@ -216,12 +216,9 @@ def told(recipe: Any, *successes: Any) -> Callable[[], None]:
 
 def unsuccessful_rollouts() -> None:
     teacher = prl.Teacher("adaptive_mixture", LINE)
-    after = {"reward": torch.ones(2, 3, 1), "done": torch.zeros(2, 3, 1, dtype=torch.bool)}
-    after["done"][:, -1] = True
-    after["terminated"] = after["done"]
     for _ in range(2):
         level = teacher.ask(2)[0].view(2, 1, 1).expand(2, 3, 1)
-        teacher.observe(TensorDict({"level_id": level, "next": after}, [2, 3]))
+        teacher.observe(rollout(torch.ones(2, 3), level_id=level))
 
 
 @pytest.mark.parametrize(

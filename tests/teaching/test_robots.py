@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import copy
 import json
 import os
@@ -252,7 +251,6 @@ MJLAB = (
     "trimesh==5.2.0 typeguard==4.6.1 tyro==1.0.17 viser==1.1.1 wandb==0.31.0 wcwidth==0.9.4 "
     "xxhash==4.1.0 zstandard==0.25.0"
 )
-OLD_ISAAC_LAB = "isaaclab==2.3.2.post1"  # which cannot be imported without Isaac Sim
 
 
 @pytest.fixture(scope="module")
@@ -422,45 +420,3 @@ def test_mjlabs_own_script_trains_and_resumes_with_a_teacher(
         assert run["logged"] == ["Curriculum/lean/lean"]
     assert 400 < first["log"]["dropped"] < 512  # but for those whose length began at 0
     assert second["log"]["dropped"] == 512  # what the first run's robots played
-
-
-@pytest.mark.slow
-def test_the_isaac_lab_before_calls_a_term_as_ours_expects(install: Install) -> None:
-    """By its source, which needs Isaac Sim to be imported."""
-    source = install(OLD_ISAAC_LAB, python="3.11") / "isaaclab/source/isaaclab/isaaclab"
-
-    def method(file: str, cls: str, name: str) -> ast.FunctionDef:
-        tree = ast.parse((source / file).read_text(encoding="utf-8"))
-        (found,) = (one for one in tree.body if isinstance(one, ast.ClassDef) and one.name == cls)
-        (function,) = (one for one in found.body if getattr(one, "name", "") == name)
-        assert isinstance(function, ast.FunctionDef)
-        return function
-
-    def in_order(function: ast.FunctionDef, *calls: str) -> None:
-        text = ast.unparse(function)
-        assert sorted(calls, key=text.index) == [*calls]
-
-    base, manager = "managers/manager_base.py", "managers/curriculum_manager.py"
-    for name, given in (("__init__", ["self", "cfg", "env"]), ("reset", ["self", "env_ids"])):
-        function = method(base, "ManagerTermBase", name)
-        assert [one.arg for one in function.args.args] == given
-    make = method(base, "ManagerBase", "_process_term_cfg_at_play")
-    in_order(make, "term_cfg.func(cfg=term_cfg, env=self._env)")
-    compute = method(manager, "CurriculumManager", "compute")
-    in_order(compute, "term_cfg.func(self._env, env_ids, **term_cfg.params)")
-    in_order(method(manager, "CurriculumManager", "reset"), "term_cfg.func.reset(env_ids=env_ids)")
-    in_order(
-        method("envs/manager_based_rl_env.py", "ManagerBasedRLEnv", "step"),
-        "self.episode_length_buf += 1",
-        "self.common_step_counter += 1",
-        "self.reset_buf = ",
-        "self.reset_time_outs = ",
-        "self._reset_idx(",
-    )
-    in_order(
-        method("envs/manager_based_rl_env.py", "ManagerBasedRLEnv", "_reset_idx"),
-        "self.curriculum_manager.compute(env_ids=env_ids)",
-        "self.reward_manager.reset(env_ids)",
-        "self.curriculum_manager.reset(env_ids)",
-        "self.episode_length_buf",
-    )

@@ -47,7 +47,7 @@ def read_attribute(environment: Any, path: str) -> Any:
 
 
 def write_attribute(environment: Any, path: str, value: Any) -> None:
-    """Sets the value at a path as of :func:`read_attribute`, and reads it back.
+    """Sets the value at a path (see :func:`read_attribute`), and reads it back.
 
     Raises:
         UnfitEnvironmentError: if nothing of the value's kind is at the path, or the new value
@@ -93,10 +93,8 @@ def _in_place_of(before: Any, value: Any, path: str) -> Any:
     """Returns a value in the type of the one that it replaces, such as a truth value's."""
     shape = (len(before),) if isinstance(before, list | tuple) else getattr(before, "shape", ())
     if isinstance(value, int | float):
-        single = before is None or isinstance(
-            before, Number | np.generic | np.ndarray | torch.Tensor
-        )
-        fits = single and not len(shape)
+        single = Number | np.bool_ | np.ndarray | torch.Tensor | None
+        fits = isinstance(before, single) and not len(shape)
     else:
         fits = not isinstance(before, Number)
     if not fits:

@@ -162,14 +162,14 @@ def cast_to(space: Any, seen: Any) -> Any:
         return tuple(cast_to(part, one) for part, one in zip(space.spaces, seen, strict=True))
     if not isinstance(space, NUMERIC):
         return seen
-    array = np.asarray(seen)
+    array, box = np.asarray(seen), isinstance(space, spaces.Box)
     fits = array.shape == space.shape and array.dtype.kind in "biuf"
     # Floats of a box are not compared one by one, which would take longer than many a step.
     floats = array.dtype.kind == "f" == space.dtype.kind
-    if fits and not (isinstance(space, spaces.Box) and (floats or array.dtype == space.dtype)):
+    if fits and not (box and (floats or array.dtype == space.dtype)):
         with np.errstate(invalid="ignore"):
-            fits = np.array_equal(array.astype(space.dtype), array)
-        fits = fits and (isinstance(space, spaces.Box) or space.contains(array.astype(space.dtype)))
+            own = array.astype(space.dtype)
+        fits = np.array_equal(own, array) and (box or space.contains(own))
     if not fits:
         raise UnfitEnvironmentError(
             f"the environment shows {shown(seen)}, {array.dtype} {list(array.shape)}; its "

@@ -236,7 +236,7 @@ class GridTask(Task):
                 batch: Any = torch.stack([levels[name] for name in names])
                 found = self.results_on(agent, batch.to(self.device), names, limit)
                 for i, name in enumerate(names):
-                    for k in range(agent.copies):
+                    for k in range(agent.copies or 1):
                         numbers = {key: float(values[k, i]) for key, values in found.items()}
                         results.append(LevelResult(name, k, about[name], numbers))
         place = {known: number for number, known in enumerate(levels)}

@@ -38,7 +38,7 @@ def solvers() -> ActorCritic:
 class Scripted:
     """Acts as a function of the state says, with a memory that counts steps."""
 
-    copies = 1
+    copies, action_key, logits_key = 1, "action", "logits"
 
     def __init__(self, act: Any) -> None:
         self._act = act
