@@ -7,6 +7,7 @@ uniform levels reach in 9 % of episodes at first. ``dense``: 16, rewarded for ge
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -159,6 +160,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("methods", nargs="+", help="names of curricula")
     parser.add_argument("--loop", choices=LOOPS, default="sparse")
     parser.add_argument("--seeds", type=int, nargs="+", default=[*range(20, 28)])
+    parser.add_argument(
+        "--settings",
+        type=json.loads,
+        default={},
+        help="of the curricula, such as '{\"concentrate\": true}'",
+    )
     parser.add_argument("--iterations", type=int, default=60, help="of training (60)")
     parser.add_argument("-o", "--output", type=Path, help="a JSON file for the rows")
     options = parser.parse_args(arguments)
@@ -171,9 +178,10 @@ def compare(options: argparse.Namespace) -> None:
     table = Table("method", "along training", "at the end", "of each seed", title=options.loop)
     rows = []
     for method in options.methods:
+        curriculum = getattr(prl.curricula, method)(**options.settings)
         found = torch.tensor(
             [
-                train(LOOPS[options.loop], method, seed, options.iterations, every=5)
+                train(LOOPS[options.loop], curriculum, seed, options.iterations, every=5)
                 for seed in options.seeds
             ]
         )
