@@ -109,6 +109,24 @@ def test_output_that_nobody_reads_any_more_ends_no_run(
     assert_same_run(whole[0], tmp_path / "run")
 
 
+def test_a_disowned_sweep_whose_terminal_closes_finishes_its_runs(
+    whole: tuple[Path, Ended], processes: Processes, tmp_path: Path
+) -> None:
+    sweep = [
+        "-m",
+        *TRAIN,
+        "seed=0,1,2",
+        f"hydra.sweep.dir={tmp_path}",
+        "hydra.sweep.subdir=${seed}",
+    ]
+    row = nth(whole[1].writes, ROW, 1)
+    ended = processes(*sweep, lost_at=row, terminal=True, ignored=[SIGHUP])
+    assert ended.code == 0
+    assert len(list(tmp_path.glob("*/summary.json"))) == 3
+    assert not list(tmp_path.glob("*/error.json"))
+    assert_same_run(whole[0], tmp_path / "0")
+
+
 def test_ctrl_c_at_a_pipeline_with_tee_saves(tmp_path: Path) -> None:
     """A real one, whose interpreters come to their own ends: Ctrl-C goes to the whole group."""
     command = [sys.executable, "-m", "proposer_rl.cli.start", *TRAIN, "schedule.updates=100000"]
