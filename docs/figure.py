@@ -117,7 +117,7 @@ def how_it_works() -> None:
         (66, 9.6, "observation,\nreward", "center"),
         (40, 26.5, "inner loop: a step is a move", "left"),
         (36, 49, "outer loop: a step is an update of the Solver", "left"),
-        (36, 36, "action: which levels the Solver trains on", "left"),
+        (36, 34, "action: which levels\nthe Solver trains on", "left"),
         (
             24,
             -4,
