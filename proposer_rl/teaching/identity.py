@@ -19,8 +19,8 @@ def of_levels(space: Any, like: Levels) -> dict[str, Any]:
         name: f"{one.dtype} {list(one.shape)}" for name, one in like.flatten_keys(".").items()
     }
     levels["number of features"] = level_inputs(space.space, like.unsqueeze(0)).shape[-1]
-    known = getattr(space, "description", {"kind": type(space).__qualname__})
-    return {**known, "levels": levels}
+    known = getattr(space, "description", {})
+    return {"kind": type(space).__qualname__, **known, "levels": levels}
 
 
 def of_classes(curriculum: Curriculum) -> str:
@@ -37,8 +37,6 @@ def require_same(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -
         ArgumentError: if they differ, naming what.
     """
     old, new = dict(_flat(before)), dict(_flat(now))
-    if old.get("kind") != new.get("kind"):
-        old, new = ({"kind": one.get("kind")} for one in (old, new))
     differ = [name for name in {**old, **new} if old.get(name, ...) != new.get(name, ...)]
     # If anything else differs, it explains differences in the entries of levels.
     differ = [name for name in differ if not name.startswith("levels.")] or differ

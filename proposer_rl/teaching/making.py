@@ -14,7 +14,7 @@ from proposer_rl.curricula.batches import moved
 from proposer_rl.meta.assembly import Components, ProposerSettings
 from proposer_rl.methods import around, asked, build, completed
 from proposer_rl.recipes import Recipe, as_recipe
-from proposer_rl.settings import ArgumentError, plain, shown
+from proposer_rl.settings import ArgumentError, plain
 from proposer_rl.teaching.identity import of_classes
 
 OF_LEVELS = ("optimal_return", "exact_performance", "performance", "play")
@@ -32,12 +32,8 @@ def make_curriculum(
         The curriculum; and its name or class with all its settings, for JSON.
 
     Raises:
-        ArgumentError: if the space is none, or the curriculum trains replicas of the learner.
+        ArgumentError: if the curriculum trains replicas of the learner.
     """
-    if not hasattr(space, "space"):
-        raise ArgumentError(
-            f"space={shown(space)}: must be Parameters, Items, LevelGenerator, MadeLevels or a task"
-        )
     run = Components(space, ProposerSettings(), seed)
     if isinstance(curriculum, type):
         curriculum = curriculum.create(run)

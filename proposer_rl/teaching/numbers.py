@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -51,11 +50,10 @@ def as_numbers(
     inside = shape == () and type(value) in (int, float) and low <= value <= high
     if inside and (not whole or value % 1 == 0):
         return np.float64(value)  # type: ignore[return-value]
-    array = None
-    with suppress(TypeError, ValueError, OverflowError):
+    try:
         array = _array(value)
-    if array is None:
-        raise ArgumentError(f"{name}={shown(value)}: must be numbers of float32")
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ArgumentError(f"{name}={shown(value)}: must be numbers of float32") from error
     if shape is not None:
         if spread and not array.ndim:
             array = np.full([one or 0 for one in shape], array)
@@ -75,8 +73,8 @@ def as_numbers(
     return array
 
 
-def _array(value: Any) -> NDArray[np.float64] | None:
-    """Returns numbers as an array; None for complex numbers, texts and the like."""
+def _array(value: Any) -> NDArray[np.float64]:
+    """Returns numbers as an array, and raises a TypeError for complex numbers, texts and so on."""
     if isinstance(value, Tensor):
         value = value.detach().cpu()
         value = (value if value.is_complex() else value.double()).numpy()  # also of bfloat16
@@ -85,7 +83,7 @@ def _array(value: Any) -> NDArray[np.float64] | None:
         value = [_array(one) if isinstance(one, special) else one for one in value]
     array = np.asarray(value)
     if array.dtype.kind not in "biufO":
-        return None
+        raise TypeError(array.dtype)
     array = array.astype(np.float64)
     if isinstance(value, np.ma.MaskedArray):
         array[np.ma.getmaskarray(value)] = np.nan

@@ -308,7 +308,6 @@ def mixed_groups(
     drawn: list[int] = []
     groups: list[Tensor] = []
     places: list[int] = []
-    rollouts = 0
     for _ in range(most):
         tickets, items = teacher.ask(count - len(places))
         try:
@@ -323,13 +322,10 @@ def mixed_groups(
         places += (mixed + len(drawn)).tolist()
         drawn += items.tolist()
         groups.append(success)
-        rollouts += success.numel()
         if len(places) == count:
             break
-    chosen = torch.tensor(places, dtype=torch.int64)
-    return MixedGroups(
-        [drawn[place] for place in places], torch.cat(groups)[chosen], chosen, rollouts
-    )
+    chosen, whole = torch.tensor(places, dtype=torch.int64), torch.cat(groups)
+    return MixedGroups([drawn[place] for place in places], whole[chosen], chosen, whole.numel())
 
 
 def _everywhere(read: Callable[[], list[T]], trace: int) -> list[T]:

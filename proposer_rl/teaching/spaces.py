@@ -73,11 +73,6 @@ class LevelSpace:
             raise ArgumentError("target: missing: this curriculum needs a space with a target")
         return self.distributions["target"]
 
-    @property
-    def description(self) -> dict[str, Any]:
-        """Describes the space, to compare states by: nested dicts of numbers and texts."""
-        return {"kind": type(self).__qualname__}
-
     def features(self, levels: Levels) -> Tensor:
         """Returns features of levels, by which models of outcomes predict: float [*B, F]."""
         if self._features is None:
@@ -87,8 +82,8 @@ class LevelSpace:
         return known.reshape(*shape, known.shape[1])
 
     def given(self, levels: Levels) -> Any:
-        """Returns levels [*B] as the loop gets them."""
-        return levels
+        """Returns levels [*B] as the loop gets them: real numbers in torch's default dtype."""
+        return in_default_dtype(levels)
 
     def rows(self, levels: Levels) -> list[Any]:
         """Returns levels [n] as a list, for loops that play episode by episode."""
@@ -170,12 +165,11 @@ class Parameters(LevelSpace, ParameterSpace):
 
     @property
     def description(self) -> dict[str, Any]:
-        """Describes the parameters, their bins, the target and the named distributions."""
+        """Describes the parameters, bins, target and named distributions, to compare states by."""
         named: dict[str, Any] = {name: self._said(part) for name, part in self._parts.items()}
         target = {"target": named.pop("target")} if "target" in named else {}
         counts = {name: len(part.low) for name, part in self.bins.items() if part.wide}
         return {
-            **super().description,
             "ranges": self._said(self.bins),
             "bins": counts,
             "seeded": self._seeded,
@@ -194,10 +188,6 @@ class Parameters(LevelSpace, ParameterSpace):
             log = ", log scale" if part.log else ""
             found[name] = str(part) if isinstance(part, Law) else said + log
         return found
-
-    def given(self, levels: TensorDictBase) -> TensorDictBase:
-        """Returns levels as loops get them: real numbers in torch's default dtype."""
-        return in_default_dtype(levels)
 
     def rows(self, levels: TensorDictBase) -> list[dict[str, Any]]:
         """Returns levels [n] as dicts of numbers and texts."""
@@ -390,11 +380,10 @@ class Items(LevelSpace):
 
     @property
     def description(self) -> dict[str, Any]:
-        """Describes the items: their number, a hash of their features, the target's places."""
+        """Describes the items, to compare states by: number, hash of features, target's places."""
         rates = {} if self.pass_rates is None else {"pass_rates": _hash(self.pass_rates)}
         places = {name: one.tolist() for name, one in self._places.items()}
         return {
-            **super().description,
             "count": self.size,
             "features": _hash(self.coordinates),
             **rates,

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
 from proposer_rl.curricula import Curriculum, Student, require
-from proposer_rl.curricula.batches import CPU, moved, packed
+from proposer_rl.curricula.batches import CPU, moved, packed, saved
 from proposer_rl.curricula.contract import proposed
 from proposer_rl.curricula.ledger import OUT, OVER, RETURNED, Block, Ledger
 from proposer_rl.models import check_torch_defaults
@@ -51,6 +51,7 @@ HOW = {  # to give results that are missing
     "rollout": "give rollouts to observe(), as with LevelTransform(tell=False)",
 }
 LEAST_BLOCK, LARGEST_BLOCK = 32, 384  # tickets, where the loop does not say how many
+PLAIN = ("levels_told", "scored", "proposals", "proposed", "at")  # attributes in a state
 Success = Literal["terminated", "truncated"] | Callable[[TensorDictBase], Tensor]
 
 
@@ -145,7 +146,7 @@ class Teacher:
         self._with_success: bool | None = None  # whether they have a success, likewise
         self._warned = False  # of a missing success
         self._proposals = self._levels_told = 0  # the latter up to the last log()
-        self._whole: list[int] = []  # first tickets of the batches that propose() returned
+        self._proposed: list[int] = []  # first tickets of the batches that propose() returned
         self._block, self._counted = None, 0
         self._use(None, 0)
         self._kept: TensorDictBase | None = None  # steps [L] of rollouts' unfinished episodes
@@ -162,7 +163,7 @@ class Teacher:
         with self._here():
             block = self._next(whole("n", n, 1))
             block.state[:] = OUT
-            self._whole.append(block.start)
+            self._proposed.append(block.start)
             self._tally.count(block.batch.levels)
             return self._levels(block)
 
@@ -266,7 +267,7 @@ class Teacher:
             if ids is None:
                 dropped = self._ledger.out
                 self._ledger.drop_all()
-                self._whole.clear()
+                self._proposed.clear()
             else:
                 tickets = as_ids("ids", ids)
                 going = tickets[~self.done_with(tickets)]
@@ -301,10 +302,10 @@ class Teacher:
                     self._tell(tickets, results_of_rollout(whole, self._success))
                 self._kept = left
                 return
-            tickets = self._proposed() if ids is None else as_ids("ids", ids)
+            tickets = self._last_proposed() if ids is None else as_ids("ids", ids)
             self._tell(tickets, results_of(outcome, self._success))
             if ids is None:
-                self._whole.clear()
+                self._proposed.clear()
 
     @torch.inference_mode(False)
     def log(self, file: str | os.PathLike[str] | None = None) -> dict[str, Any]:
@@ -341,14 +342,10 @@ class Teacher:
             return {
                 "of": self._of,
                 "id": self.id,
-                "levels_told": self._levels_told,
                 "curriculum": self.curriculum.state_dict(),
                 "ledger": self._ledger.state_dict(),
-                "scored": self._scored,
-                "proposals": self._proposals,
-                "proposed": list(self._whole),
                 "block": None if self._block is None else self._block.start,
-                "at": self._at,
+                **{name: saved(getattr(self, f"_{name}")) for name in PLAIN},
                 "rollout": None if kept is None else packed(kept),
             }
 
@@ -370,12 +367,11 @@ class Teacher:
                     "state: levels of this teacher are still out; load it before collectors and "
                     "environments begin, or call drop() and reset the environments"
                 )
-            self.id, self._levels_told = state["id"], state["levels_told"]
+            self.id = state["id"]
+            for name in PLAIN:
+                setattr(self, f"_{name}", saved(state[name]))
             self.curriculum.load_state_dict(state["curriculum"])
             self._ledger.load_state_dict(state["ledger"], self._like)
-            self._scored = state["scored"]
-            self._proposals, self._at = state["proposals"], state["at"]
-            self._whole = list(state["proposed"])
             blocks = {block.start: block for block in self._ledger.blocks}
             self._block, self._tally = None, Tally(self.space)
             self._use(blocks.get(state["block"]), self._at)
@@ -506,10 +502,10 @@ class Teacher:
         self._warned = True
         warnings.warn(f"success: {missing}; {HOW['success']}", stacklevel=3)
 
-    def _proposed(self) -> NDArray[np.int64]:
+    def _last_proposed(self) -> NDArray[np.int64]:
         """Returns the tickets of the only batch that is out."""
-        whole = [block for block in self._ledger.blocks if block.start in self._whole]
-        out = [block for block in whole if OUT in block.state]
+        blocks = self._ledger.blocks
+        out = [block for block in blocks if block.start in self._proposed and OUT in block.state]
         if len(out) != 1:
             how = f"{len(out)} batches are out" if out else "nothing is out"
             raise ArgumentError(

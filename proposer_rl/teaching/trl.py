@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import update_wrapper
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import torch
 from transformers import TrainerCallback
 
-from proposer_rl.runs.folder import write_atomically
 from proposer_rl.settings import ArgumentError
 from proposer_rl.teaching.sampler import TeacherSampler
 from proposer_rl.teaching.teacher import Teacher
@@ -147,7 +145,4 @@ class TaughtReward(TrainerCallback):
                 "sampler": self._sampler.state_dict(),
                 "told": self._told,
             }
-            content = BytesIO()
-            torch.save(made, content)
-            file = Path(args.output_dir) / f"checkpoint-{state.global_step}" / FILE
-            write_atomically(file, content.getvalue())
+            torch.save(made, Path(args.output_dir) / f"checkpoint-{state.global_step}" / FILE)

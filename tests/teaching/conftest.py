@@ -11,6 +11,10 @@ from pathlib import Path
 import pytest
 
 Install = Callable[..., Path]
+LOADERS = (  # accelerate and what it needs
+    "accelerate==1.15.0 huggingface-hub==2.4.0 safetensors==0.8.0 psutil==7.2.2 hf-xet==1.8.0 "
+    "httpx2==2.16.2 httpcore2==2.16.2 truststore==0.10.5 typer==0.29.2 shellingham==1.5.4"
+)
 
 
 @pytest.fixture(scope="session")

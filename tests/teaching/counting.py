@@ -87,9 +87,7 @@ class LevelsEnv(EnvBase):
     def __init__(self, count: int | None = 4) -> None:
         super().__init__(batch_size=[] if count is None else [count])
         shape = self.batch_size
-        self.level = torch.zeros(shape, dtype=torch.int64)
-        self.played = torch.zeros(shape, dtype=torch.int64)
-        self.steps = torch.zeros(shape, dtype=torch.int64)
+        self.level = self.played = self.steps = torch.zeros(shape, dtype=torch.int64)
         seen = Unbounded((*shape, 1))
         success = Binary(1, (*shape, 1), dtype=torch.bool)
         self.observation_spec = Composite(observation=seen, success=success, shape=shape)
@@ -105,10 +103,9 @@ class LevelsEnv(EnvBase):
         mask = mask.reshape(self.batch_size)
         self.steps = self.steps.where(~mask, 0)
         self.played = self.level.where(mask, self.played)
-        return TensorDict(
-            {"observation": self.steps.unsqueeze(-1).float(), "success": self._never()},
-            self.batch_size,
-        )
+        never = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
+        seen = self.steps.unsqueeze(-1).float()
+        return TensorDict({"observation": seen, "success": never}, self.batch_size)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self.steps = self.steps + 1
@@ -123,9 +120,6 @@ class LevelsEnv(EnvBase):
             },
             self.batch_size,
         )
-
-    def _never(self) -> torch.Tensor:
-        return torch.zeros(*self.batch_size, 1, dtype=torch.bool)
 
     def _set_seed(self, seed: int | None) -> None:
         pass

@@ -99,11 +99,6 @@ def test_ranges_and_counts_may_be_of_any_library() -> None:
         block=torch.tensor(7),
     )
     assert teacher.ask(np.int64(4))[1].batch_size == (4,)
-    stages = prl.curricula.hand_designed(
-        distributions=OmegaConf.create(["target", "all"]), until=np.array([1])
-    )
-    teacher = prl.Teacher(stages, space, block=np.int64(1))
-    assert teacher.ask()[1]["a"] == 2 and teacher.ask()[1]["a"] != 2
 
 
 NORMAL = {"distribution": "norm", "loc": 8.0, "scale": 2.0}
@@ -298,7 +293,6 @@ WRONG: list[tuple[Any, Any, dict[str, Any], str]] = [
     (D, 2, {"pass_rates": [0.5, 1.5]}, "pass_rates=1.5: must be from 0 to 1"),
     (D, 2, {"pass_rates": [0.5]}, r"pass_rates: has shape \[1\], but must have \[2\]"),
     (PLR, LINE, {"sing": abs}, "sing: unknown; there are: play, "),
-    (PLR, {"s": (0.0, 1.0)}, {}, "space={'s': .*: must be Parameters, Items"),
     (prl.Teacher, "prl", {"space": LINE}, "curriculum='prl': must be .* one of accel"),
     (prl.Teacher, prl.tasks.maze(), {"space": LINE}, "curriculum=Recipe.*: must be prl"),
 ]  # fmt: skip

@@ -23,7 +23,7 @@ from torch.utils.data import BatchSampler
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
 from tests.host_reads import CountedReads
-from tests.teaching.conftest import Install
+from tests.teaching.conftest import LOADERS, Install
 from tests.teaching.counting import ITEMS, Counting, through_torch
 
 REPEAT = 3
@@ -167,19 +167,14 @@ def test_an_epoch_goes_on_from_every_place() -> None:
         replayed(rounds=1)[1].load_state_dict(state)
 
 
-LOADERS = (
-    "torchdata==0.11.0 accelerate==1.15.0 huggingface-hub==2.4.0 safetensors==0.8.0 psutil==7.2.2 "
-    "hf-xet==1.8.0 httpx2==2.16.2 httpcore2==2.16.2 truststore==0.10.5 typer==0.29.2 "
-    "shellingham==1.5.4"
-)
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # torchdata's own
 @pytest.mark.parametrize("stateful", [True, False])
 def test_loaders_that_go_on_find_the_place(stateful: bool, install: Install) -> None:
     """torchdata's by the sampler's state; accelerate's skips what it has had."""
-    sys.path.append(str(install(LOADERS)))  # last: what is there already stays
+    sys.path.append(
+        str(install(f"torchdata==0.11.0 {LOADERS}"))
+    )  # last: what is there already stays
     made: Any = import_module("torchdata.stateful_dataloader" if stateful else "accelerate")
 
     def batches(sampler: prl.TeacherSampler) -> Any:

@@ -205,7 +205,7 @@ def test_a_state_of_another_space_is_refused_and_changes_nothing(what: str) -> N
 @pytest.mark.parametrize(
     ("before", "now", "message"),
     [
-        ("plr", "domain_randomization", "kind was plr, is domain_randomization$"),
+        ("plr", "domain_randomization", "kind was plr, is domain_randomization; "),
         ("model_transport", MODEL, "model.labels was above_w.*, is success"),
     ],
 )

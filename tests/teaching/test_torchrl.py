@@ -39,14 +39,13 @@ def taught(teacher: Any, count: int | None = LEVELS, **how: Any) -> TransformedE
     return TransformedEnv(LevelsEnv(count), prl.LevelTransform(teacher, set_level, **how))
 
 
+def collecting(env: Any, steps: int, **how: Any) -> Collector:
+    policy, frames = RandomPolicy(LevelsEnv().action_spec), LEVELS * steps
+    return Collector(env, policy, frames_per_batch=frames, total_frames=-1, **how)
+
+
 def collected(env: Any, steps: int, batches: int, **how: Any) -> list[Any]:
-    collector = Collector(
-        env,
-        RandomPolicy(LevelsEnv().action_spec),
-        frames_per_batch=LEVELS * steps,
-        total_frames=-1,
-        **how,
-    )
+    collector = collecting(env, steps, **how)
     rollouts = [collector.rollout().clone() for _ in range(batches)]
     collector.shutdown()
     return rollouts
@@ -79,15 +78,7 @@ def test_an_episode_is_put_together_from_whichever_rows_it_is_in(how: str) -> No
     Whole episodes, also those that began in an earlier rollout.
     """
     teacher = counted("rollout", "success", block=3)
-    workers = [
-        Collector(
-            taught(teacher, tell=False),
-            RandomPolicy(LevelsEnv().action_spec),
-            frames_per_batch=LEVELS * 3,
-            total_frames=-1,
-        )
-        for _ in range(2)
-    ]
+    workers = [collecting(taught(teacher, tell=False), 3) for _ in range(2)]
     for _ in range(6):
         rollouts = [worker.rollout().clone() for worker in workers]
         if how == "split":

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import runpy
 import sys
 from collections.abc import Callable
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
@@ -13,28 +13,22 @@ import torch
 
 import proposer_rl as prl
 from proposer_rl.settings import ArgumentError
-from tests.teaching.conftest import Install
+from tests.teaching.conftest import LOADERS, Install
 
 pytestmark = pytest.mark.slow
 
 PACKAGES = (
-    "trl==1.16.0 transformers==5.24.0 datasets==5.2.0 accelerate==1.15.0 tokenizers==0.23.3 "
-    "huggingface-hub==2.4.0 safetensors==0.8.0 pyarrow==26.0.1 multiprocess==0.70.19 dill==0.4.1 "
-    "xxhash==4.1.0 regex==2026.11.19 hf-xet==1.8.0 httpx2==2.16.2 httpcore2==2.16.2 "
-    "truststore==0.10.5 typer==0.29.2 shellingham==1.5.4 psutil==7.2.2"
+    f"trl==1.16.0 transformers==5.24.0 datasets==5.2.0 tokenizers==0.23.3 pyarrow==26.0.1 "
+    f"multiprocess==0.70.19 dill==0.4.1 xxhash==4.1.0 regex==2026.11.19 {LOADERS}"
 )
 EXAMPLE = Path(__file__).parents[2] / "examples" / "taught_prompts.py"
 ROWS, ANSWERS = 10, 2
 Settings = dict[str, Any]
 NAMES = ("gradient_accumulation_steps", "per_device_train_batch_size", "steps_per_generation")
-TWICE = {"num_iterations": 2}
 SETTINGS: dict[str, Settings] = {
     "a generation a step": dict(zip(NAMES[:2], (1, 8), strict=True)),
     "TRL's defaults": dict(zip(NAMES[:2], (4, 4), strict=True)),
-    "a generation for four steps": {
-        **dict(zip(NAMES, (1, 2, 2), strict=True)),
-        "num_iterations": 2,
-    },
+    "a generation for four steps": dict(zip(NAMES, (1, 2, 2), strict=True), num_iterations=2),
     "four generations in three steps": dict(zip(NAMES, (4, 2, 3), strict=True)),
 }
 
@@ -205,9 +199,6 @@ def test_what_does_not_fit_is_refused_in_one_line(taught: Any, what: str, tmp_pa
 
 
 def test_the_example_trains(taught: Any) -> None:
-    spec = spec_from_file_location("taught_prompts", EXAMPLE)
-    assert spec is not None and spec.loader is not None
-    example = module_from_spec(spec)
-    spec.loader.exec_module(example)
-    within, solved = example.main(prl.curricula.plr(**example.REPLAY), steps=3)
+    example = runpy.run_path(str(EXAMPLE))
+    within, solved = example["main"](prl.curricula.plr(**example["REPLAY"]), steps=3)
     assert 0 <= within <= 1 and 0 <= solved <= 100
