@@ -93,19 +93,12 @@ def test_levels_may_be_options_of_a_reset() -> None:
     assert env.unwrapped.options == {"more": 1, **info["level"]}
 
 
-class Parts(LevelEnv):
-    """With numbers in arrays, a text and a truth value."""
-
-    def __init__(self) -> None:
-        self.model = SimpleNamespace(opt=SimpleNamespace(gravity=np.array([0.0, 0.0, -9.81])))
-        self.ground, self.windy, self.masses = "flat", False, {"torso": 1.0}
-
-
 def test_attributes_lie_in_parts_of_the_environment_and_in_arrays() -> None:
     ranges = {"g": (-9.5, -9.4), "h": ["grass", "stairs"], "windy": [True], "mass": range(2, 5)}
     sets = {"g": "model.opt.gravity.2", "h": "ground", "windy": "windy", "mass": "masses.torso"}
     teacher = prl.Teacher("domain_randomization", prl.Parameters(ranges))
-    env = Parts()
+    model = SimpleNamespace(opt=SimpleNamespace(gravity=np.array([0.0, 0.0, -9.81])))
+    env: Any = answering(model=model, ground="flat", windy=False, masses={"torso": 1.0})
     level = prl.TaughtEnv(env, teacher, sets).reset()[1]["level"]
     assert env.model.opt.gravity.tolist() == [0.0, 0.0, level["g"]]
     assert (env.ground, env.windy, env.masses) == (level["h"], True, {"torso": level["mass"]})
