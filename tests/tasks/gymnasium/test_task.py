@@ -230,9 +230,9 @@ def test_the_files_that_the_page_shows_are_all_that_is_needed(
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     write_files(readme, Path())
     write_files(page, Path())
-    module = re.search(r"`(\w+\.py)`:\n\n```python\n(.*?)```", page, re.DOTALL)
+    module = re.search(r"```python\n(.*?gymnasium\.register\(.*?\n)", page, re.DOTALL)
     assert module is not None
-    Path(module[1]).write_text(module[2], encoding="utf-8")
+    Path("corridor.py").write_text(module[1], encoding="utf-8")
     for name in ("hill", "corridor"):
         every = [*commands(page), *commands(readme)]
         _, *words = next(words for words in every if f"task={name}" in words)
