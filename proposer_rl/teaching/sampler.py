@@ -186,8 +186,9 @@ class TeacherSampler(Sampler[int]):
         names = ("repeat", "group", "rounds")
         groups = dict(zip(names, [self._repeat, self._group, self._rounds], strict=True))
         require_same("sampler", dict(zip(names, state["groups"], strict=True)), groups)
-        self._out = defaultdict(list)  # whose items are texts if the state was stored as JSON
-        self._out.update({int(item): list(tickets) for item, tickets in state["out"].items()})
+        # Items are texts if the state was stored as JSON.
+        out = {int(item): list(tickets) for item, tickets in state["out"].items()}
+        self._out = defaultdict(list, out)
         self._came = {
             int(item): [answer and Answer(*answer) for answer in answers]
             for item, answers in state["came"].items()

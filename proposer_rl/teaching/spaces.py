@@ -345,8 +345,7 @@ class Items(LevelSpace):
         named: Mapping[str, Sequence[int]] | None = None,
     ) -> None:
         check_torch_defaults()
-        count = whole("count", count, 1)
-        self.size = count
+        self.size = count = whole("count", count, 1)
         self.axes = {"item": range(count)}
         lines, self.categories = item_table(
             torch.arange(count).unsqueeze(-1) if features is None else features
@@ -420,8 +419,7 @@ class Items(LevelSpace):
 
     def rows(self, levels: TensorDictBase) -> list[int]:
         """Returns places as Python's numbers."""
-        places: list[int] = levels["item"].tolist()
-        return places
+        return [*levels["item"].tolist()]
 
 
 def _among(places: Tensor, count: int, generator: torch.Generator) -> TensorDict:
