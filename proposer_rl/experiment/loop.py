@@ -334,7 +334,7 @@ class SideBySide:
         known = hasattr(task.space, "locate") and bool(task.space.axes)
         none_yet = torch.zeros(task.space.size, dtype=torch.int64)
         counted = known and task.space.size <= MANY_BINS
-        # Levels of each bin, int64 [N]; None where the curriculum itself tells of them.
+        # Levels of each bin, int64 [N]; None if the curriculum logs its own.
         self._counts = [none_yet.clone() if counted else None for _ in curricula]
         for student, curriculum in zip(self.students, self.curricula, strict=True):
             require(student, curriculum.needs, type(curriculum).__name__)
