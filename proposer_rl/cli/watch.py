@@ -199,7 +199,8 @@ def overview(found: Sequence[Progress]) -> RenderableType:
     ]
     states = [progress.state for progress in found]
     counts = ", ".join(f"{states.count(state)} {state}" for state in COLOURS if state in states)
-    return Group(table, *told, Text(f"{len(found)} runs: {counts}"))
+    total = "1 run" if len(found) == 1 else f"{len(found)} runs"
+    return Group(table, *told, Text(f"{total}: {counts}"))
 
 
 def _measured(runs: Sequence[Run]) -> tuple[str, str, str]:

@@ -32,7 +32,7 @@ def test_one_run_is_a_row_with_its_curve(tmp_path: Path, capsys) -> None:
     assert listing(tmp_path) == before
     (row,) = [line for line in text.splitlines() if line.startswith("run ") and "state" not in line]
     assert "finished" in row and "20/20" in row and "ID success 0.900" in row
-    assert set(row) & set(BLOCKS[1:]) and "1 runs: 1 finished" in text
+    assert set(row) & set(BLOCKS[1:]) and "1 run: 1 finished" in text
 
 
 def test_seeds_of_which_one_is_a_row_ahead_are_drawn(tmp_path: Path, capsys) -> None:
