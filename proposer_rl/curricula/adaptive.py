@@ -98,7 +98,6 @@ AT_ONCE, LARGE = 64, 512
 MOST_LEVELS = 3072  # candidates of a batch, where more are wanted where it is concentrated
 FORBIDDEN = 1e3  # cost of a candidate that is not mastered
 FAILURES = 4.0  # on the target, that are taken for seen at the beginning
-SHOWN = 6  # levels of each arm that a reader is shown
 OUTLIERS, MOST_OUTLIERS = 1000, 63  # one in so many returns at either end; and at most
 EQUAL = 1e-9  # returns that differ no more than this are equal, in units of the largest
 
@@ -140,7 +139,6 @@ class AdaptiveMixture(Curriculum):
         "_shown",
         "_belief",
         "_last",
-        "_some",
     )
 
     @checked
@@ -176,10 +174,6 @@ class AdaptiveMixture(Curriculum):
         self._last: Levels = one[:0]  # of the bridge, [m]
         self._came: list[dict[str, Any]] = []  # what the next proposal learns from
         self._seen = Predictions()
-        # Of the last proposal some levels, and their arms.
-        self._some = TensorDict(
-            {"level": self._last, "arm": torch.zeros(0, dtype=torch.int64)}, [0]
-        )
         self._shown: dict[str, Any] = {}
 
     @classmethod
@@ -194,8 +188,6 @@ class AdaptiveMixture(Curriculum):
             self._learn(seen, batches)
         levels, arms = self._batch(count, self._shares(), rng.generator("levels"))
         inputs, items = self._inputs(levels), self._items(levels)
-        few = torch.cat([(arms == i).nonzero().flatten()[:SHOWN] for i in range(len(ARMS))])
-        self._some = TensorDict({"level": levels[few], "arm": arms[few]}, [len(few)])
         notes = {"arm": arms, "inputs": inputs, "predicted": self._belief.predict(inputs, items)}
         if items is not None:
             notes["items"] = items
@@ -217,10 +209,6 @@ class AdaptiveMixture(Curriculum):
         :func:`~proposer_rl.curricula.outcome_model.calibration`.
         """
         shown, self._shown = self._shown, {}
-        if len(self._some):
-            levels, arms = self._some["level"], self._some["arm"]
-            shown["levels"] = {ARMS[i]: levels[arms == i] for i in arms.unique().tolist()}
-            self._some = self._some[:0]
         return shown | self._seen.log()
 
     def _learn(self, seen: Mapping[str, Any], batches: float) -> None:

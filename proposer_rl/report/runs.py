@@ -23,7 +23,6 @@ import pandas as pd
 from proposer_rl.runs.folder import SLACK
 from proposer_rl.runs.records import (
     Column,
-    LevelRecord,
     Record,
     SampleRecord,
     TaskFacts,
@@ -55,7 +54,6 @@ class Run:
         cycles: what the curriculum recorded, one per cycle; every entry but updates is optional.
         samples: recorded levels, one record per evaluation.
         levels: results on every level at the end, [levels], by the measurement's column.
-        sheets: pictures of levels by their captions, as the curriculum recorded them last.
     """
 
     folder: Path
@@ -70,7 +68,6 @@ class Run:
     cycles: Sequence[Record]
     samples: Sequence[SampleRecord]
     levels: Mapping[str, Column] = field(default_factory=dict)
-    sheets: Mapping[str, Sequence[LevelRecord]] = field(default_factory=dict)
 
     @property
     def method(self) -> str:
@@ -155,7 +152,6 @@ class Run:
             cycles=[cycle for cycle in self.cycles if number(cycle["updates"]) < horizon],
             samples=[sample for sample in self.samples if sample.updates <= horizon],
             levels={},
-            sheets={},
         )
 
     def reached(self, measurement: str, threshold: float) -> float:

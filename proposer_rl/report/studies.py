@@ -52,11 +52,6 @@ class Group:
         return [run.seed for run in self.runs]
 
     @property
-    def proposes(self) -> bool:
-        """True if a Proposer was trained."""
-        return any("total_reward" in cycle for run in self.runs for cycle in run.cycles)
-
-    @property
     def logs(self) -> list[Run]:
         """The runs with cycles of their own; seeds that were trained together may share them."""
         return list({run.whose_cycles: run for run in self.runs if run.cycles}.values())

@@ -62,7 +62,6 @@ class TaskFacts(BaseModel):
             name.
         about: further facts, by label.
         measured: everything that must be equal for two runs to be comparable.
-        samples: levels of each distribution.
         key: explains pictures of levels.
         text_key: explains levels that are drawn in characters.
         exact: whether measurements draw nothing at random; None if that is not known.
@@ -74,7 +73,6 @@ class TaskFacts(BaseModel):
     space: dict[str, list[FiniteFloat | str]] = {}
     about: dict[str, str] = {}
     measured: Any
-    samples: dict[str, list[LevelRecord]] = {}
     key: str = ""
     text_key: str = ""
     exact: bool | None = None

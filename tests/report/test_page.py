@@ -10,7 +10,7 @@ import pytest
 
 from proposer_rl.report import build
 from proposer_rl.report.build import write_report
-from proposer_rl.report.figures import cost_curves
+from proposer_rl.report.figures import learning_curves
 from tests.browser import chromium, needs_chromium, new_context
 from tests.report.folders import LEVEL, PIXELS, cycle, png, write_jsonl, write_run
 
@@ -51,8 +51,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def written(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build, "DRAWINGS", [cost_curves])
-        return write_report([runs], tmp_path_factory.mktemp("out") / "report", progress=False)
+        patch.setattr(build, "DRAWINGS", [learning_curves])
+        return write_report([runs], tmp_path_factory.mktemp("out") / "report")
 
 
 class Seen:
@@ -113,7 +113,7 @@ def test_what_is_ticked_is_compared_alone_and_in_colour(
     assert {trace["name"] for trace in seen.traces(".curves", "band")} == coloured
     seen.tick(".against", "target")
     assert [trace["name"] for trace in seen.traces(".curves", "rest")] == ["perf_gain"]
-    planned = write_report([runs], tmp_path, progress=False, compare=["target", HOSTILE])
+    planned = write_report([runs], tmp_path, compare=["target", HOSTILE])
     page = seen.page.context.new_page()
     page.goto(planned.as_uri())
     page.wait_for_selector("html[data-ready]")

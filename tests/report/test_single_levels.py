@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from proposer_rl.report import build
 from proposer_rl.report.charts import charts
-from proposer_rl.report.figures import difficulty
 from proposer_rl.report.measures import worst, worst_means
 from proposer_rl.report.statistics import median_interval, median_of
 from proposer_rl.report.studies import Study, read_studies
@@ -64,7 +63,7 @@ def test_the_page_says_whether_selection_bias_is_in_it(
     exact: bool | None, text: str, tmp_path: Path
 ) -> None:
     study_of(tmp_path / "runs", exact)
-    page = build.write_report([tmp_path / "runs"], tmp_path / "report", progress=False)
+    page = build.write_report([tmp_path / "runs"], tmp_path / "report")
     assert text in page.read_text(encoding="utf-8")
 
 
@@ -91,14 +90,3 @@ def test_levels_of_runs_that_are_not_at_the_horizon_do_not_count(tmp_path: Path)
     target = study.group("target")
     assert study.group("plr") is None and study.scores(plr, "id_success") is None
     assert target is not None and study.scores(target, "id_success").shape == (5, 3)
-
-
-def test_a_legend_has_the_methods_that_are_drawn(tmp_path: Path) -> None:
-    """Not those whose runs keep no levels, or no table of what the Solver trained on."""
-    write_run(tmp_path / "full", "target", levels=[0.5])
-    write_run(tmp_path / "bare", "plr")
-    (tmp_path / "bare" / "training.csv").unlink()
-    study = read_studies([tmp_path / "full", tmp_path / "bare"], None)[0][0]
-    assert set(study.legend) == {"target", "plr"}
-    drawing = difficulty(study)
-    assert drawing is not None and drawing.legend == {"target": study.legend["target"]}

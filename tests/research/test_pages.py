@@ -15,7 +15,7 @@ from scipy import integrate, stats
 
 from proposer_rl.cli.help import needs
 from proposer_rl.recipes import CONFIG_FOLDER
-from proposer_rl.report.figures import cost_curves, learning_curves
+from proposer_rl.report.figures import learning_curves
 from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing
@@ -28,7 +28,7 @@ from research.generalisation import (
     read_scores,
     write_scores,
 )
-from research.pages import CHOICE, CLAIMS, main
+from research.pages import CHOICE, CLAIMS, cost_curves, difficulty, main
 from research.ranking import EXACT, STEADY, budgets, choices, needs_of
 from research.timing import read_timing, timed
 from tests.report.folders import TASK, cycle, write_rockets, write_run, write_seconds
@@ -464,3 +464,14 @@ def test_performance_that_is_played_is_no_exact_evaluation(tmp_path: Path) -> No
         write_run(tmp_path / str(exact), "mine", task=task)
         (study,), _ = read_studies([tmp_path / str(exact)], None)
         assert (EXACT in needs_of(study.groups[0], {})) == exact
+
+
+def test_a_legend_has_the_methods_that_are_drawn(tmp_path: Path) -> None:
+    """Not those whose runs keep no levels, or no table of what the Solver trained on."""
+    write_run(tmp_path / "full", "target", levels=[0.5])
+    write_run(tmp_path / "bare", "plr")
+    (tmp_path / "bare" / "training.csv").unlink()
+    study = read_studies([tmp_path / "full", tmp_path / "bare"], None)[0][0]
+    assert set(study.legend) == {"target", "plr"}
+    drawing = difficulty(study)
+    assert drawing is not None and drawing.legend == {"target": study.legend["target"]}
