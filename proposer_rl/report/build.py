@@ -28,16 +28,6 @@ DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
     figures.heat_maps,
 )
 
-# A caveat on means over the worst share of the levels, by whether measurements are exact.
-SELECTION = {
-    True: "Measurements are exact, so sorting the levels by them adds no bias, and no second "
-    "evaluation is needed.",
-    False: "Measurements are sampled and the levels are sorted by them, so selection bias makes "
-    "these means too low, the more the smaller the share.",
-    None: "The runs do not say whether their measurements are exact. If they are sampled, "
-    "selection bias makes these means too low, the more the smaller the share.",
-}
-
 
 def read_checked(
     folders: Sequence[Path],
@@ -199,8 +189,6 @@ def _section(
         "meanings": page.methods(study, meanings),
         "data": page.pack(json.dumps(data, allow_nan=False, separators=(",", ":"))),
         "staged": data["stages"] is not None,
-        "single": bool(data["levels"]),
-        "selection": SELECTION[study.example.task.exact],
         "methods": methods,
         "tables": tables,
         "commands": page.commands(study),

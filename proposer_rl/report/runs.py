@@ -27,12 +27,15 @@ from proposer_rl.runs.records import (
     SampleRecord,
     TaskFacts,
     encoded,
+    flat,
     number,
 )
 
 COST = ("updates", "frames", "curriculum_frames", "evaluations", "seconds")
 # Columns of training.csv that are PPO's, besides its losses; the others are the task's.
 OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_norm"}
+# Entries of a cycle's record that are not the curriculum's own.
+PLACE = {"cycle", "updates", "seed", "curriculum_frames", "evaluations", "histogram"}
 _STUDENT = re.compile(r"lifetime_(\d{1,9})")
 STUDY = "runs.csv.xz"  # a folder with this file is a study
 NAMES = ("metrics", "training", "cycles", "levels")
@@ -128,6 +131,12 @@ class Run:
     def own_seconds(self) -> Column:
         """Wall seconds at each evaluation; an even share where seeds were trained together."""
         return self.columns["seconds"] / self.shared_by
+
+    @cached_property
+    def told(self) -> Sequence[Mapping[str, float]]:
+        """The curriculum's own numbers in each cycle."""
+        own = ({k: v for k, v in cycle.items() if k not in PLACE} for cycle in self.cycles)
+        return [flat(cycle) for cycle in own]
 
     def last(self, name: str) -> float:
         """Returns the last value of a column of the measurements."""

@@ -243,8 +243,8 @@ def test_shares_of_batches_are_curves_over_updates(tmp_path: Path) -> None:
     write_run(tmp_path / "run", cycles=cycles)
     (study,), _ = read_studies([tmp_path / "run"], None)
     found = {one.name: one for one in own_numbers(study)}
-    series = found["share of the batch: way"].axes[UPDATES](study.groups[0])
-    assert found.keys() == {"share of the batch: way", "share of the batch: rest"}
+    series = found["shares/way"].axes[UPDATES](study.groups[0])
+    assert found.keys() == {"shares/way", "shares/rest"}
     assert all(one.rate for one in found.values())
     assert series is not None and series.columns.tolist() == [0, 10, 20]
     np.testing.assert_allclose(series.to_numpy()[0], [0.3, np.nan, 0.5])

@@ -136,7 +136,7 @@ def test_shares_of_batches_are_entries_by_name(tmp_path: Path) -> None:
     rows = [{"told": 4, "drawn": {}, "shares": shares} for shares in ({"way": [0.2, 0.4]}, None)]
     write_jsonl(tmp_path / "x.jsonl", rows)
     found = read_log(tmp_path / "x.jsonl").entries
-    np.testing.assert_allclose(found["share: way"], [0.3, np.nan])
+    np.testing.assert_allclose(found["shares/way"], [0.3, np.nan])
 
 
 def test_logs_of_one_name_are_told_apart(tmp_path: Path) -> None:
