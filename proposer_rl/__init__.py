@@ -19,11 +19,12 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    if name.startswith("__") and name != "__all__":
+    if name == "__all__":
+        return __dir__()
+    if name.startswith("__"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module("proposer_rl.api"), name)
 
 
 def __dir__() -> list[str]:
-    names: list[str] = import_module("proposer_rl.api").__all__
-    return names
+    return [name for name in vars(import_module("proposer_rl.api")) if not name.startswith("_")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -12,8 +13,9 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
+from proposer_rl.cli.build import Stage, StoredRun, stored_run
 from proposer_rl.cli.errors import ConfigError, check_file, command
-from proposer_rl.cli.stored import Stage, StoredRun, stored_run, write_rows
+from proposer_rl.runs.folder import write_atomically
 
 Rows = list[dict[str, Any]]
 STAGES = "A run keeps a checkpoint of every stage with schedule.keep_checkpoints=1000."
@@ -59,3 +61,9 @@ def answer(
         write_rows(rows, options.output)
 
     command(body)
+
+
+def write_rows(rows: Sequence[Any], file: Path | None) -> None:
+    """Write rows as JSON, if a file is given."""
+    if file is not None:
+        write_atomically(file, (json.dumps(rows, indent=1) + "\n").encode())

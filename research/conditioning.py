@@ -16,9 +16,8 @@ from rich.table import Table
 from tensordict import TensorDict
 from torch import Tensor
 
-from proposer_rl.cli.build import make_task
+from proposer_rl.cli.build import StoredRun, make_task, stored_run
 from proposer_rl.cli.config import saved_config
-from proposer_rl.cli.stored import StoredRun, stored_run
 from proposer_rl.curricula import ProposerCurriculum
 from proposer_rl.methods import Components, frozen_proposer
 from proposer_rl.models import draw_at, uniform_noise

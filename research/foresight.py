@@ -17,8 +17,8 @@ from rich.table import Table
 from scipy.stats import bootstrap, linregress, rankdata
 from torch import Tensor
 
+from proposer_rl.cli.build import Stage, StoredRun
 from proposer_rl.cli.errors import ConfigError, number
-from proposer_rl.cli.stored import Stage, StoredRun
 from proposer_rl.learning import PPO
 from proposer_rl.meta.actions import Mixture
 from proposer_rl.meta.env import SolverTrainingEnv, SolverView

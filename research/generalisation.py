@@ -10,12 +10,14 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import pandas as pd
+
 from proposer_rl.report.comparisons import Outcome, at_the_end
 from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.runs import Run
 from proposer_rl.report.statistics import INTERVALS
 from proposer_rl.report.studies import Group, Study
-from proposer_rl.report.tables import Cell, Table, from_csv, to_csv
+from proposer_rl.report.tables import Cell, Table
 from proposer_rl.runs.folder import is_rate
 from proposer_rl.runs.records import encoded, number, words
 
@@ -46,7 +48,7 @@ class Score(NamedTuple):
 
 def write_scores(scores: Iterable[Score]) -> bytes:
     """Scores as CSV."""
-    return encoded(to_csv(Score._fields, [list(score) for score in scores]))
+    return encoded(pd.DataFrame(scores).to_csv(index=False, float_format="%.6g"))
 
 
 def read_scores(file: Path) -> list[Score]:
@@ -55,10 +57,10 @@ def read_scores(file: Path) -> list[Score]:
         rows = csv.DictReader(io.StringIO(file.read_text(encoding="utf-8-sig")))
         return [
             Score(
-                from_csv(row["run"]),
+                row["run"],
                 int(row["seed"]),
                 int(row["updates"]),
-                from_csv(row["levels"]),
+                row["levels"],
                 int(row["size"]),
                 number(float(row["success"] or "nan")),
                 number(float(row["returns"] or "nan")),

@@ -28,7 +28,7 @@ from torchrl.objectives.value import GAE
 
 import proposer_rl as prl
 from proposer_rl.cli.errors import command
-from proposer_rl.cli.stored import write_rows
+from research.common import write_rows
 
 STEPS, SIZE = 40, 7
 PARAMETERS = {"distance": (0.5, 4.0), "wind": (0.0, 0.6), "radius": (0.15, 0.5)}

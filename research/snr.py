@@ -16,8 +16,8 @@ import torch
 from rich.table import Table
 from torch import Tensor
 
+from proposer_rl.cli.build import Stage, StoredRun
 from proposer_rl.cli.errors import number
-from proposer_rl.cli.stored import Stage, StoredRun
 from proposer_rl.meta.actions import Actions, Mixture, ProblemChoices
 from proposer_rl.meta.assembly import MixtureSettings
 from proposer_rl.meta.env import SolverTrainingEnv, SolverView

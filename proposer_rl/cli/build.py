@@ -1,14 +1,17 @@
-"""Builds the parts of an experiment from its configuration, without writing anything."""
+"""Builds the parts of an experiment from its configuration, or reads them from a run's folder."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from tensordict import TensorDict
 
-from proposer_rl.cli.config import RunConfig, task_maker
+from proposer_rl.cli.config import RunConfig, saved_config, task_maker
 from proposer_rl.cli.errors import ConfigError
 from proposer_rl.curricula import Curriculum, LearnedCurriculum, TaskStudent, require
 from proposer_rl.experiment import Experiment, Log, check_headline
@@ -19,6 +22,7 @@ from proposer_rl.meta.workers import WorkerSettings
 from proposer_rl.methods import INPUT_ERRORS
 from proposer_rl.methods import build as build_curriculum
 from proposer_rl.models import available_cores, check_torch_defaults, use_device
+from proposer_rl.runs.checkpoint import checkpoint_files, load_checkpoint, load_latest
 from proposer_rl.runs.folder import RunFolder
 from proposer_rl.runs.process import Status, StopSignals
 from proposer_rl.settings import within
@@ -130,11 +134,9 @@ def _workers(config: RunConfig, task: Task) -> Workers | None:
     on_gpus = task.device.type == "cuda"
     gpus = torch.cuda.device_count()
     count = compute.workers or min(copies, gpus if on_gpus else available_cores())
-    devices = compute.worker_devices or [task.device.type]
-    if compute.collector == "multiprocess":  # Ray assigns devices to its workers itself
-        if on_gpus and compute.worker_devices is None:
-            devices = [f"cuda:{index}" for index in range(gpus)]
-        devices = [str(_device(name, "worker_devices")) for name in devices]
+    devices = [task.device.type]
+    if on_gpus and compute.collector == "multiprocess":  # Ray assigns devices itself
+        devices = [f"cuda:{index}" for index in range(gpus)]
     cores = compute.cores or max(1, available_cores() // count)
     settings = WorkerSettings(compute.collector, count, devices, cores, compute.ray_address)
     context = ComputeContext(
@@ -144,10 +146,64 @@ def _workers(config: RunConfig, task: Task) -> Workers | None:
     return settings, make
 
 
-def _device(name: str, key: str = "device") -> torch.device:
+def _device(name: str) -> torch.device:
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
-    with within(f"compute.{key}", RuntimeError, AssertionError, lead=f"compute.{key}={name}: "):
+    with within("compute", RuntimeError, AssertionError, lead=f"compute.device={name}: "):
         probe = torch.ones(1, device=name)
         probe.item()  # the device "meta" computes nothing
     return probe.device
+
+
+class Stage(NamedTuple):
+    """A run's Solvers at a checkpoint."""
+
+    step: int
+    updates: int
+    learner: PPO
+
+    @property
+    def solver(self) -> TensorDict:
+        """A snapshot of the first of them, batch [1]."""
+        return self.learner.snapshot()[:1]
+
+
+class StoredRun(NamedTuple):
+    """A run that has checkpoints."""
+
+    folder: Path
+    config: RunConfig
+    task: Task
+    files: list[Path]  # its checkpoints, oldest first; at least one
+
+    def stage(self, file: Path | None = None, seeds: Sequence[int] | None = None) -> Stage:
+        """Returns the Solvers of some seeds in one of the files.
+
+        Args:
+            file: None for the newest checkpoint that is intact.
+            seeds: None for all.
+        """
+        seeds = self.config.seeds if seeds is None else seeds
+        found = load_latest(self.files[-1].parent) if file is None else load_checkpoint(file)
+        assert found is not None, "there is a checkpoint"
+        step, state = found
+        learner = self.task.learner([Streams(seed) for seed in seeds])
+        every = TensorDict(state["solver"], [len(self.config.seeds)])
+        with within("checkpoint", ValueError):  # of another network
+            learner.restore(every[[self.config.seeds.index(seed) for seed in seeds]])
+        return Stage(step, int(state["updates"]), learner)
+
+
+def stored_run(path: Path) -> StoredRun:
+    """Reads the settings of a run and makes its task.
+
+    Args:
+        path: the folder, or one of its checkpoints, which is then the only file.
+    """
+    folder, files = path.resolve(), [file for _, file in checkpoint_files(path / "checkpoints")]
+    if path.is_file():
+        folder, files = folder.parent.parent, [path]
+    if not files:
+        raise ConfigError(f"{path}: holds no checkpoints; give a run's folder or a checkpoint")
+    config = saved_config(folder)
+    return StoredRun(folder, config, make_task(config), files)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -84,7 +83,6 @@ class ComputeSettings:
         collector: where a Proposer's replicas are trained: in this process, in several, or by Ray.
         workers: processes for the replicas; None for one for each GPU or core, at most one for each
             replica.
-        worker_devices: of the workers, in turn; None for all GPUs, or the CPU.
         ray_address: of a Ray cluster, such as auto or 10.0.0.1:6379; None for one on this machine.
         progress: draw progress bars.
     """
@@ -96,7 +94,6 @@ class ComputeSettings:
     cores: Annotated[int, Ge(1), Le(1024)] | None = None
     collector: Literal["single", "multiprocess", "ray"] = "single"
     workers: Annotated[int, Ge(1)] | None = None
-    worker_devices: Annotated[list[str], Len(1)] | None = None
     ray_address: str | None = None
     progress: bool = True
 
@@ -147,14 +144,6 @@ def read_config(config: DictConfig) -> RunConfig:
         )
     if len(set(read.seeds)) < len(read.seeds):
         raise ConfigError(f"seeds={read.seeds}: must be distinct")
-    until = read.curriculum.get("until")
-    ends = [end for end in until if isinstance(end, int)] if isinstance(until, list) else []
-    if max(ends, default=0) >= read.schedule.updates:
-        warnings.warn(
-            f"curriculum.until={until}: the last stage never begins, since the run ends after "
-            f"{read.schedule.updates} updates",
-            stacklevel=2,
-        )
     return read
 
 

@@ -6,22 +6,20 @@ Help and refusals come before what takes seconds to import.
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
+import pandas as pd
 
 from proposer_rl.cli.errors import ConfigError, check_file, command, number
 from proposer_rl.runs.folder import write_atomically
+from proposer_rl.runs.records import encoded, printable
 
 if TYPE_CHECKING:
-    from proposer_rl.cli.stored import Stage, StoredRun
+    from proposer_rl.cli.build import Stage, StoredRun
     from proposer_rl.task import LevelResult
 
 MOST_STEPS = 10**5
@@ -95,23 +93,17 @@ class Evaluation(NamedTuple):
 
 def list_levels(options: argparse.Namespace) -> None:
     """Evaluates one run, prints its levels one by one, and writes the files asked for."""
-    from proposer_rl.cli.stored import write_rows
-
     evaluation = evaluate(load(options.checkpoint), options.levels, options.max_steps)
     _print(evaluation)
-    if options.output is not None and options.output.suffix == ".csv":
-        from proposer_rl.report.tables import to_csv  # which takes seconds to import
-
-        rows = evaluation.rows()
-        table = to_csv(list(rows[0]), [list(row.values()) for row in rows])
-        write_atomically(options.output, table.encode())
-    else:
-        write_rows(evaluation.rows(), options.output)
+    if options.output is not None:
+        rows, as_csv = evaluation.rows(), options.output.suffix == ".csv"
+        text = pd.DataFrame(rows).to_csv(index=False) if as_csv else json.dumps(rows, indent=1)
+        write_atomically(options.output, encoded(text))
 
 
 def load(checkpoint: Path) -> tuple[StoredRun, Stage]:
     """Loads the Solvers of a run's newest checkpoint, or of the checkpoint given."""
-    from proposer_rl.cli.stored import stored_run
+    from proposer_rl.cli.build import stored_run
 
     run = stored_run(checkpoint)
     return run, run.stage(checkpoint if checkpoint.is_file() else None)
@@ -134,44 +126,20 @@ def evaluate(
 
 
 def _print(evaluation: Evaluation) -> None:
-    shown, count = _hardest(evaluation.results), len({each.level for each in evaluation.results})
-    some = f", the {len(shown)} hardest of {count} levels" if len(shown) < count else ""
-    seeds = evaluation.run.config.seeds
-    run = f"{evaluation.run.folder.name}, seed {', '.join(map(str, seeds))}"
-    run += f", {evaluation.updates} updates"
-    title = f"{run}: {evaluation.levels}{some}"
-    caption = "Means over the seeds." if len(seeds) > 1 else ""
-    table = Table(box=SIMPLE_HEAD, title=Text(title), caption=caption)
-    table.add_column("level", overflow="fold", min_width=16)
-    example = evaluation.results[0]
-    for name in (*example.about, *example.results):
-        table.add_column(name.replace("_", " "), justify="right")
-    for of_level in shown:
-        about = [f"{value:g}" for value in of_level[0].about.values()]
-        table.add_row(Text(of_level[0].level), *about, *_means(of_level))
-    table.add_section()
-    table.add_row(f"mean of {count}", *[""] * len(example.about), *_means(evaluation.results))
-    Console().print(table)
-
-
-def _hardest(results: Sequence[LevelResult]) -> list[list[LevelResult]]:
-    """Groups results by level, and keeps the levels with the least success or return if many.
-
-    It is the mean over the Solvers that counts; levels stay in their order.
-    """
-    found: dict[str, list[LevelResult]] = {}
-    for each in results:
-        found.setdefault(each.level, []).append(each)
-    kind = "success" if "success" in results[0].results else "return"
-    ranked = sorted(found, key=lambda level: np.mean([each.results[kind] for each in found[level]]))
-    kept = set(ranked[:SHOWN])
-    return [of_level for level, of_level in found.items() if level in kept]
-
-
-def _means(results: Sequence[LevelResult]) -> list[str]:
-    names = results[0].results
-    means = {name: sum(each.results[name] for each in results) / len(results) for name in names}
-    return [f"{m:.1%}" if "success" in name else f"{m:.3f}" for name, m in means.items()]
+    run, updates, levels, results = evaluation
+    rows = [{"level": printable(one.level), **one.about, **one.results} for one in results]
+    means = pd.DataFrame(rows).groupby("level", sort=False).mean()
+    kind = "success" if "success" in means else "return"
+    shown = means[means[kind].rank(method="first") <= SHOWN].copy()
+    some = f", the {len(shown)} hardest of {len(means)} levels" if len(shown) < len(means) else ""
+    seeds = ", ".join(map(str, run.config.seeds))
+    print(f"{run.folder.name}, seed {seeds}, {updates} updates: {levels}{some}")
+    if len(run.config.seeds) > 1:
+        print("Means over the seeds.")
+    texts = {name: "{:g}".format for name in results[0].about}
+    texts |= {name: "{:.1%}".format for name in means if "success" in name}
+    shown.loc[f"mean of {len(means)}"] = means.mean()
+    print(shown.to_string(formatters=texts, float_format="{:.3f}".format, index_names=False))
 
 
 if __name__ == "__main__":

@@ -54,8 +54,8 @@ def _run(options: argparse.Namespace) -> None:
 def open_session(folder: Path) -> Session:
     """Returns the session that shows the run in a folder."""
     settings_file(folder)  # before slow imports
+    from proposer_rl.cli.build import stored_run
     from proposer_rl.cli.run import run_name
-    from proposer_rl.cli.stored import stored_run
     from proposer_rl.play.session import Session
 
     stored = stored_run(folder)

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from proposer_rl.report.statistics import Interval
+import pandas as pd
 
-# Spreadsheets read text that begins with one of these as a formula.
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
+from proposer_rl.report.statistics import Interval
 
 Cell = str | int | float | Interval | None
 
@@ -62,21 +59,7 @@ class Table:
             if any(isinstance(cell, Interval) for cell in cells):
                 for end in ("low", "high"):
                     columns[f"{name}, {end}"] = [getattr(cell, end, None) for cell in cells]
-        return to_csv(list(columns), list(zip(*columns.values(), strict=True)))
-
-
-def to_csv(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """Returns CSV for spreadsheets and pandas; floats have six significant digits."""
-    file = io.StringIO()
-    csv.writer(file, lineterminator="\n").writerows(
-        [_csv_cell(cell) for cell in row] for row in (header, *rows)
-    )
-    return file.getvalue()
-
-
-def from_csv(text: str) -> str:
-    """Removes the quote that :func:`to_csv` puts before a text that looks like a formula."""
-    return text[1:] if text.startswith(tuple(f"'{begin}" for begin in FORMULA)) else text
+        return str(pd.DataFrame(columns).to_csv(index=False, float_format="%.6g"))
 
 
 def write(cell: Cell, digits: int | None = None) -> str:
@@ -104,9 +87,3 @@ def escape_markdown(text: str) -> str:
     for character in "\\|<>`*_[]":
         text = text.replace(character, f"\\{character}")
     return " ".join(text.split())
-
-
-def _csv_cell(cell: Any) -> Any:
-    if isinstance(cell, float):
-        return "" if math.isnan(cell) else f"{cell:.6g}"
-    return f"'{cell}" if isinstance(cell, str) and cell.startswith(FORMULA) else cell

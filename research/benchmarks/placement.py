@@ -33,8 +33,8 @@ def throughput(options: Options) -> Result:
             rounds = {
                 "one process": _cycle(scale, options, stack),
                 "one process, half of the copies": _cycle(half, options, stack),
-                "one worker": _cycle(scale, options, stack, *_workers(engine, 1, options)),
-                "two workers": _cycle(scale, options, stack, *_workers(engine, 2, options)),
+                "one worker": _cycle(scale, options, stack, *_workers(engine, 1)),
+                "two workers": _cycle(scale, options, stack, *_workers(engine, 2)),
             }
             seconds = interleave(rounds, options.few, options.device)
         against = {
@@ -59,8 +59,8 @@ def throughput(options: Options) -> Result:
     return Result(rows, [Table(title, ["engine", "where", "seconds"], lines)])
 
 
-def _workers(engine: str, count: int, options: Options) -> list[str]:
-    chosen = [f"collector={engine}", f"workers={count}", f"worker_devices=['{options.device}']"]
+def _workers(engine: str, count: int) -> list[str]:
+    chosen = [f"collector={engine}", f"workers={count}"]
     return [f"compute.{choice}" for choice in chosen]
 
 

@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import Browser, BrowserContext, Download, Locator, expect
 from playwright.sync_api import Page as Tab
 
-from proposer_rl.cli.stored import stored_run
+from proposer_rl.cli.build import stored_run
 from proposer_rl.models import cell_logits
 from proposer_rl.tasks.mazes.drawings import SETS, read_levels
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator

@@ -16,10 +16,9 @@ import httpx
 import pytest
 import torch
 
-from proposer_rl.cli.build import make_task
+from proposer_rl.cli.build import make_task, stored_run
 from proposer_rl.cli.config import saved_config
 from proposer_rl.cli.eval import evaluate, load
-from proposer_rl.cli.stored import stored_run
 from proposer_rl.play.server import STATIC
 from proposer_rl.runs.folder import read_jsonl
 from proposer_rl.streams import Streams

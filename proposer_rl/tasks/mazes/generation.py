@@ -69,7 +69,7 @@ def generate_levels(
         >>> levels = generate_levels(0.25, [3, 5], height=6, width=6)
         >>> levels.walls.sum((-2, -1))
         tensor([9, 9])
-        >>> from proposer_rl import shortest_path_length
+        >>> from proposer_rl.tasks.mazes import shortest_path_length
         >>> shortest_path_length(levels)
         tensor([3, 5])
     """
