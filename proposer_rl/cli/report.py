@@ -9,8 +9,6 @@ from functools import partial
 from pathlib import Path
 
 from proposer_rl.cli.errors import command, number
-from proposer_rl.cli.help import choices
-from proposer_rl.recipes import CONFIG_FOLDER
 
 EPILOG = """\
 examples:
@@ -54,7 +52,6 @@ def _run(options: argparse.Namespace) -> None:
         options.folder,
         options.output,
         *asked,
-        meanings={group: choices(group, [CONFIG_FOLDER]) for group in ("method", "ablation")},
     )
     print(printable(f"Report: {page}"))
 

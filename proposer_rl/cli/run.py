@@ -21,13 +21,13 @@ from proposer_rl.cli.errors import ConfigError, one_line, say
 from proposer_rl.cli.groups import Invocation, quoted
 from proposer_rl.cli.help import choices, needs
 from proposer_rl.cli.loggers import logger
-from proposer_rl.experiment import Experiment
 from proposer_rl.meta.workers import WorkersError
 from proposer_rl.recipes import CONFIG_FOLDER
 from proposer_rl.runs.checkpoint import checkpoint_bytes, checkpoint_files
 from proposer_rl.runs.folder import PROPOSER, RunFolder, storage, write_atomically
 from proposer_rl.runs.process import Interrupted, Status, StopSignals, locked, processor
 from proposer_rl.runs.records import TaskFacts, checked, small_json
+from proposer_rl.task import Task
 
 SUMMARY = "summary.json"
 # A resumed run may differ in these: where it is computed and shown, and how long it is.
@@ -116,7 +116,7 @@ def proceed(
         return finished
     with logger(config.logger, path, run_name(config), asdict(config)) as log:
         experiment = build(config, made, folder, signals, status, log)
-        facts = identity(experiment, config, asked)
+        facts = identity(made.task, config, asked)
         described = {"planned_updates": config.schedule.updates, "task": made.task.facts}
         folder.write_json("run.json", {**facts, **described})
         result = experiment.run()
@@ -206,28 +206,21 @@ def run_name(config: RunConfig) -> str:
     return f"{config.method}{ablation}_seed_{'-'.join(map(str, config.seeds))}"
 
 
-def identity(experiment: Experiment, config: RunConfig, asked: Invocation) -> dict[str, Any]:
+def identity(task: Task, config: RunConfig, asked: Invocation) -> dict[str, Any]:
     """Returns what identifies a run: method, seeds, command, machine and versions."""
-    device = experiment.task.device
+    device = task.device
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else ""
     packages = ("proposer_rl", "torchrl", "tensordict", "hydra-core")
-    parameters = sum(p.numel() for p in experiment.learner.agent.parameters())
     return {
         "method": config.method,
-        "scale": config.scale,
-        "ablation": config.ablation,
-        "seed": config.seed,
         "seeds": config.seeds,
         "about": _about(config, asked.config_dir),
         "overrides": asked.overrides,
         "settings": asked.settings,
         "arguments": {"config_dir": asked.config_dir, "pythonpath": asked.python_path},
-        "solver_parameters": parameters // len(config.seeds),
         "device": f"{device.type} {name}".strip(),
         "machine": f"{processor()}, {os.cpu_count()} cores, {platform.system()}",
         "threads": torch.get_num_threads(),
-        "collector": config.compute.collector,
-        "workers": config.compute.workers,
         "versions": {
             "python": platform.python_version(),
             "torch": str(torch.__version__),  # with its build, which some wheels' metadata lack

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from proposer_rl.report import arena, figures, outcomes, page, runs, teachers
 from proposer_rl.report.charts import charts
-from proposer_rl.report.outcomes import Meanings, answer
+from proposer_rl.report.outcomes import answer
 from proposer_rl.report.reading import OutputError, begun, find_runs
 from proposer_rl.report.statistics import FEWEST, HELD
 from proposer_rl.report.studies import Study, read_studies
@@ -58,8 +58,6 @@ def write_report(
     threshold: float | None = None,
     baselines: Sequence[str] = (),
     compare: Sequence[str] = (),
-    *,
-    meanings: Meanings | None = None,
 ) -> Path:
     """Writes a report and returns the path of its page.
 
@@ -73,12 +71,10 @@ def write_report(
             ``target``.
         compare: labels of the methods whose comparison was planned, for which alone p-values are
             corrected; by default all methods.
-        meanings: what methods and ablations do, by ``method`` or ``ablation`` and name, for runs
-            that do not tell.
     """
     check_output(output, PAGE)
     logs = [path for path in folders if path.suffix == LOG]
-    curves = teachers.read_curves(logs)
+    curves, of_teachers = teachers.read_curves(logs)
     of_runs = [path for path in folders if path.suffix != LOG]
     studies, notes = read_checked(of_runs, threshold, baselines, compare) if of_runs else ([], [])
     files: dict[str, bytes] = {}
@@ -93,14 +89,14 @@ def write_report(
         prefix = f"{_slug(study.title)}_" if len(studies) > 1 else ""
         if f"{TABLES}/{prefix}runs.csv" in files:  # same title, other measurements
             prefix += f"{len(sections) + 1}_"
-        sections.append(_section(study, prefix, files, meanings or {}))
+        sections.append(_section(study, prefix, files))
         parts.append(page.section(study, f"{FIGURES}/{prefix}"))
     told: page.Section | None = None
-    if curves.logs:
-        drawings = teachers.drawings(curves.logs)
+    if curves:
+        drawings = teachers.drawings(curves)
         still = [page.figure(one, _drawn(one, "", files)) for one in drawings]
-        told = {"notes": curves.notes, "figures": still}
-        parts.append(page.of_teachers(drawings, curves.notes, f"{FIGURES}/"))
+        told = {"notes": of_teachers, "figures": still}
+        parts.append(page.of_teachers(drawings, of_teachers, f"{FIGURES}/"))
     command = page.report_command("bin/report", folders, threshold, baselines, compare=compare)
     html = page.render(
         title=title,
@@ -160,9 +156,7 @@ def _add(tables: Sequence[Table], prefix: str, files: dict[str, bytes]) -> None:
         files[f"{TABLES}/{prefix}{table.name}.md"] = encoded(table.to_markdown())
 
 
-def _section(
-    study: Study, prefix: str, files: dict[str, bytes], meanings: Meanings
-) -> page.Section:
+def _section(study: Study, prefix: str, files: dict[str, bytes]) -> page.Section:
     """Returns the page's section on a study, and adds its files to ``files``."""
     methods = outcomes.group_table(study)
     tables = [outcomes.comparison_table(study), outcomes.run_table(study)]
@@ -186,7 +180,7 @@ def _section(
         "facts": page.facts(study),
         "origin": page.origin(study),
         "incomplete": page.incomplete(study),
-        "meanings": page.methods(study, meanings),
+        "meanings": page.methods(study),
         "data": page.pack(json.dumps(data, allow_nan=False, separators=(",", ":"))),
         "staged": data["stages"] is not None,
         "methods": methods,

@@ -29,8 +29,6 @@ from proposer_rl.report.tables import Cell, Table, write
 from proposer_rl.runs.records import level_text, words
 
 MILLION = 1e6
-# Descriptions of methods and ablations, by ``method`` or ``ablation`` and name.
-Meanings = Mapping[str, Mapping[str, str]]
 LISTED = 6  # methods that a sentence names
 
 
@@ -307,16 +305,11 @@ def answer(study: Study) -> list[str]:
     return sentences
 
 
-def meaning(group: Group, meanings: Meanings) -> str:
-    """Describes a method in a line, as its runs recorded it or else as given."""
-    run = group.runs[0]
-    about = run.facts.get("about", {})
-    said = [
-        about.get(kind) or meanings.get(kind, {}).get(name, "")
-        for kind, name in (("method", run.method), ("ablation", run.ablation))
-    ]
-    text = said[0] or "Its runs do not say what it does."
-    text += f" Changed here: {said[1]}" if said[1] else ""
+def meaning(group: Group) -> str:
+    """Describes a method in a line, as its runs recorded it."""
+    about = group.runs[0].facts.get("about", {})
+    text = about.get("method") or "Its runs do not say what it does."
+    text += f" Changed here: {about['ablation']}" if about.get("ablation") else ""
     return f"{text} ({group.setting})" if group.setting else text
 
 

@@ -20,7 +20,6 @@ from PIL import Image
 
 from proposer_rl.report import arena
 from proposer_rl.report.outcomes import (
-    Meanings,
     Row,
     about_rows,
     answer,
@@ -90,9 +89,9 @@ def figure(drawing: Drawing, png: bytes) -> Section:
     }
 
 
-def methods(study: Study, meanings: Meanings) -> list[tuple[str, str]]:
+def methods(study: Study) -> list[tuple[str, str]]:
     """Returns the methods with their descriptions."""
-    return [(group.label, meaning(group, meanings)) for group in study.groups]
+    return [(group.label, meaning(group)) for group in study.groups]
 
 
 def first(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import FigureBase
@@ -25,25 +25,12 @@ X = "levels told"
 
 
 class Log:
-    """The lines of a log.
-
-    Args:
-        rows: the lines. ``teacher`` is the teacher of a line, and ``levels_told`` the number of
-            levels told to it since it began; lines without these are of one teacher.
-    """
+    """The lines of a log, as :meth:`Teacher.log` writes them."""
 
     def __init__(self, rows: Sequence[Record]) -> None:
         self.rows = rows
-
-    @cached_property
-    def x(self) -> Column:
-        """The number of levels that each line's teacher had been told, float [m]."""
-        found, told = [], dict[Any, float]()
-        for row in self.rows:
-            whose = row.get("teacher")
-            told[whose] = row.get("levels_told", told.get(whose, 0) + row["told"])
-            found.append(float(told[whose]))
-        return np.array(found)
+        # The number of levels that each line's teacher had been told since it began, float [m].
+        self.x = np.array([row["levels_told"] for row in rows], float)
 
     @cached_property
     def entries(self) -> dict[str, Column]:
@@ -69,35 +56,23 @@ class Log:
             By what tells them apart; a log that is one curve by the empty text.
         """
         parts: dict[tuple[Any, int], list[Record]] = {}
-        starts: dict[tuple[Any, int], float] = {}
         last: dict[Any, tuple[int, float]] = {}
-        for row, x in zip(self.rows, self.x.tolist(), strict=True):
-            whose, start = row.get("teacher"), x - row["told"]
-            part, before = last.get(whose, (1, 0.0))
-            if start < before:  # the loop went on from an earlier state than its last line's
-                part += 1
-            last[whose] = part, x
-            parts.setdefault((whose, part), []).append(row)
-            starts.setdefault((whose, part), start)
+        for row in self.rows:
+            part, before = last.get(row["teacher"], (1, 0.0))
+            part += _start(row) < before  # the loop went on from an earlier state than its last
+            last[row["teacher"]] = part, row["levels_told"]
+            parts.setdefault((row["teacher"], part), []).append(row)
         found = {}
         for (whose, part), rows in parts.items():
             names = [f"teacher {whose}"] if len(last) > 1 else []
-            if part > 1:
-                names.append(f"part {part}, from {starts[whose, part]:g} levels on")
+            names += [f"part {part}, from {_start(rows[0]):g} levels on"] if part > 1 else []
             found[", ".join(names)] = Log(rows)
         return found
 
 
-class Curves(NamedTuple):
-    """The curves of some logs.
-
-    Attributes:
-        logs: by their labels.
-        notes: on files that are more than one curve.
-    """
-
-    logs: dict[str, Log]
-    notes: list[str]
+def _start(row: Record) -> float:
+    """Returns how many levels a teacher had been told before a line of its log."""
+    return float(row["levels_told"] - row["told"])
 
 
 def read_log(file: Path) -> Log:
@@ -110,13 +85,18 @@ def read_log(file: Path) -> Log:
         rows: Sequence[dict[str, Any]] = read_jsonl(file)
     except (OSError, ValueError) as error:
         raise UnreadableRun(f"{file}: {printable(str(error))}") from error
-    if not rows or not all("told" in row and "drawn" in row for row in rows):
+    if not rows or not all(
+        {"teacher", "levels_told", "told", "drawn"} <= row.keys() for row in rows
+    ):
         raise UnreadableRun(f"{file}: is not a log that teacher.log(file) has written")
     return Log(rows)
 
 
-def read_curves(files: Sequence[Path]) -> Curves:
+def read_curves(files: Sequence[Path]) -> tuple[dict[str, Log], list[str]]:
     """Reads logs and splits them by teacher.
+
+    Returns:
+        The logs by their labels, and notes on files that are more than one curve.
 
     Raises:
         UnreadableRun: for a file that is not such a log.
@@ -133,7 +113,7 @@ def read_curves(files: Sequence[Path]) -> Curves:
                 f"{label} has {len(found)} curves, since several teachers have written to it, or a "
                 "loop has gone on from an earlier state."
             )
-    return Curves(logs, notes)
+    return logs, notes
 
 
 def drawings(logs: Mapping[str, Log]) -> list[Drawing]:

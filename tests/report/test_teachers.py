@@ -15,6 +15,8 @@ from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.teachers import drawings, read_curves, read_log
 from tests.report.folders import write_jsonl, write_run
 
+LINE = {"teacher": "3f0a", "levels_told": 4, "told": 4, "drawn": {}}
+
 
 def log(file: Path, curriculum: str) -> list[dict]:
     space = prl.Parameters({"<b>gravity": (5.0, 25.0), "ground": ["flat", "stairs"]}, bins=3)
@@ -50,7 +52,7 @@ def test_the_page_has_the_entries_of_all_logs_and_what_was_drawn(tmp_path: Path)
 @pytest.mark.usefixtures("undrawn")
 def test_logs_stand_on_the_page_of_runs(tmp_path: Path) -> None:
     write_run(tmp_path / "run")
-    write_jsonl(tmp_path / "mine.jsonl", [{"told": 4, "drawn": {}, "mean_return": 1}])
+    write_jsonl(tmp_path / "mine.jsonl", [{**LINE, "mean_return": 1}])
     given = [str(tmp_path / name) for name in ("run", "mine.jsonl")]
     main([*given, "-o", str(tmp_path / "page")])
     page = (tmp_path / "page" / "report.html").read_text(encoding="utf-8")
@@ -126,14 +128,14 @@ def test_a_teacher_whose_state_is_put_back_is_another_part_of_its_curve(tmp_path
         again = prl.Teacher("plr", space, block=8)
         again.load_state_dict(state)
         go_on(again, 2)
-    assert {label: log.x.tolist() for label, log in read_curves([file]).logs.items()} == {
+    assert {label: log.x.tolist() for label, log in read_curves([file])[0].items()} == {
         "x": [8, 16, 24, 32, 40],
         "x, part 2, from 16 levels on": [24, 32],
     }
 
 
 def test_shares_of_batches_are_entries_by_name(tmp_path: Path) -> None:
-    rows = [{"told": 4, "drawn": {}, "shares": shares} for shares in ({"way": [0.2, 0.4]}, None)]
+    rows = [{**LINE, "shares": shares} for shares in ({"way": [0.2, 0.4]}, None)]
     write_jsonl(tmp_path / "x.jsonl", rows)
     found = read_log(tmp_path / "x.jsonl").entries
     np.testing.assert_allclose(found["shares/way"], [0.3, np.nan])
@@ -143,8 +145,8 @@ def test_logs_of_one_name_are_told_apart(tmp_path: Path) -> None:
     files = [tmp_path / name / "x.jsonl" for name in "ab"]
     for file in files:
         file.parent.mkdir()
-        write_jsonl(file, [{"told": 4, "drawn": {}}])
-    assert list(read_curves(files).logs) == list(map(str, files))
+        write_jsonl(file, [LINE])
+    assert list(read_curves(files)[0]) == list(map(str, files))
 
 
 @pytest.mark.parametrize(
