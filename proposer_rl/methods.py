@@ -165,18 +165,14 @@ def mixture(run: Components, *, parts: dict[str, dict[str, Any]]) -> Mixed:
             as for :func:`filter_asked`.
 
     Raises:
-        ArgumentError: for an unknown method or setting, for a setting that the method's file takes
-            from elsewhere and that is not given, or if all shares are zero.
+        ArgumentError: for an unknown method or setting, or if all shares are zero.
     """
     made: list[tuple[Curriculum, float]] = []
     with within("parts"):
         refuse_unknown(parts, available("method"))
         for name, given in parts.items():
-            try:
+            with within(name):
                 made += _part(run, name, **given)
-            except ArgumentError as error:
-                line = str(error).removeprefix("curriculum.")
-                raise ArgumentError(f"{name}.{line}") from error
     return Mixed([curriculum for curriculum, _ in made], [share for _, share in made])
 
 
@@ -194,11 +190,7 @@ def _part(
     if not share:
         return []
     recipe = recipe_function("method", name, Modelled.around)(**given)
-    config = asked(recipe, filter, resolve=False)
-    for key, value in config["curriculum"].items():
-        if isinstance(value, str) and value.startswith("${"):
-            raise ArgumentError(f"{key}: missing; the method by itself has that of {value[2:-1]}")
-    return [(build(config, run), share)]
+    return [(build(asked(recipe, filter, resolve=False), run), share)]
 
 
 def target(run: Components) -> SamplingCurriculum:
@@ -281,7 +273,7 @@ def task_difficulty(run: Components, *, checkpoint: str | None = None) -> Propos
     return proposer(run, reward=rewards.task_difficulty, checkpoint=checkpoint)
 
 
-def frozen_proposer(run: Components, *, checkpoint: str | None = None) -> ProposerCurriculum:
+def frozen_proposer(run: Components, *, checkpoint: str) -> ProposerCurriculum:
     """Makes a curriculum of a Proposer that was trained in another run, and learns no more.
 
     Args:
@@ -290,13 +282,8 @@ def frozen_proposer(run: Components, *, checkpoint: str | None = None) -> Propos
         checkpoint: a checkpoint of that run, its ``proposer.pt``, or its folder.
 
     Raises:
-        ArgumentError: if none is named, it holds no such Proposer, or cannot be read.
+        ArgumentError: if it holds no such Proposer, or cannot be read.
     """
-    if not checkpoint:
-        raise ArgumentError(
-            f"checkpoint={checkpoint!r}: must name a run's folder or a checkpoint that has a "
-            "Proposer"
-        )
     task, config = run.task, run.proposer
     return ProposerCurriculum(
         _agent(run, config, checkpoint),

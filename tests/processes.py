@@ -29,8 +29,6 @@ from typing import Any
 
 from tqdm import tqdm
 
-from proposer_rl.runs.process import PROGRESS
-
 ROOT = Path(__file__).resolve().parents[1]
 CAPABILITIES_VERSION = 0x20080522  # capget(2)
 CAP_DAC_OVERRIDE = 1
@@ -41,8 +39,7 @@ LONGEST = 200  # seconds; a child that takes longer hangs: it shows where, and e
 class Ended:
     """How a child ended: its exit code, or minus the signal's number; what it said and did.
 
-    ``writes`` names its calls of fsync and replace in order, such as ``"fsync metrics.csv"``. Those
-    of ``progress.json`` are no part of it: how many there are, the clock decides.
+    ``writes`` names its calls of fsync and replace in order, such as ``"fsync metrics.csv"``.
     """
 
     code: int
@@ -240,18 +237,17 @@ def _note_writes(signal_at: dict[int, int], lost_at: int | None, noted: int) -> 
 
     def call(name: str, file: Any, *arguments: Any) -> Any:
         path = Path(os.readlink(f"/proc/self/fd/{file}") if name == "fsync" else str(file))
-        if path.name != f".{PROGRESS}.tmp":
-            os.write(noted, f"{name} {path.name}\n".encode())
-            index = next(indices)
-            if index == lost_at:
-                hung_up = select.poll()
-                hung_up.register(1, 0)
-                hung_up.poll()
-            signum = signal_at.get(index)
-            if signum is not None:
-                if signum == SIGKILL and name == "fsync" and path.name.startswith(".step_"):
-                    os.ftruncate(file, os.fstat(file).st_size // 2)
-                os.kill(os.getpid(), signum)
+        os.write(noted, f"{name} {path.name}\n".encode())
+        index = next(indices)
+        if index == lost_at:
+            hung_up = select.poll()
+            hung_up.register(1, 0)
+            hung_up.poll()
+        signum = signal_at.get(index)
+        if signum is not None:
+            if signum == SIGKILL and name == "fsync" and path.name.startswith(".step_"):
+                os.ftruncate(file, os.fstat(file).st_size // 2)
+            os.kill(os.getpid(), signum)
         return originals[name](file, *arguments)
 
     for name in originals:

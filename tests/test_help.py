@@ -23,7 +23,7 @@ FILES = [
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: f"{file.parent.name}-{file.stem}")
 def test_every_choice_is_listed_and_has_a_line_for_reports(file: Path) -> None:
-    section = help_text([]).partition(f"{file.parent.name}= ")[2].partition("\n\n")[0]
+    section = help_text().partition(f"{file.parent.name}= ")[2].partition("\n\n")[0]
     assert file.stem in re.findall(r"[\w/]+", section)
     line = next(comments(file))
     assert len(line) > 10 and line.endswith(".")
@@ -37,20 +37,11 @@ def test_every_group_that_a_command_adds_is_listed() -> None:
 
 
 def test_the_examples_are_valid() -> None:
-    examples = re.findall(r"^  bin/train (\+.*|-m .*)$", help_text([]).split("Examples:")[1], re.M)
+    examples = re.findall(r"^  bin/train (\+.*|-m .*)$", help_text().split("Examples:")[1], re.M)
     assert len(examples) == 3
     for example in examples:
         overrides = [word for word in shlex.split(example, comments=True) if "=" in word]
         assert composed(*(word.partition(",")[0] for word in overrides)).method == "perf_gain"
-
-
-def test_files_of_ones_own_are_listed(tmp_path: Path) -> None:
-    (tmp_path / "method").mkdir()
-    (tmp_path / "method" / "mine.yaml").write_text("# @package _global_\n# My own.\nmethod: mine\n")
-    for option in (["--config-dir", str(tmp_path)], [f"--config-dir={tmp_path}"]):
-        said = help_text([*option, "--help"])
-        assert re.search(r"\bmine\b", said)
-    assert not re.search(r"\bmine\b", help_text(["--help"]))
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["+method=target", "-h"]])
@@ -61,7 +52,7 @@ def test_help_imports_nothing_that_takes_time(arguments: list[str], tmp_path: Pa
     )
     ended = python(code, *arguments, path=CONFIG_FOLDER.parent, folder=tmp_path)
     assert ended.returncode == 0, ended.stderr
-    assert ended.stdout == help_text([]) + "\n"
+    assert ended.stdout == help_text() + "\n"
     assert list(tmp_path.iterdir()) == []
 
 

@@ -143,7 +143,7 @@ def test_the_mixture_of_thirds_asks_one_model_of_success_and_nobody_else() -> No
         ({"plrr": {}}, r"^curriculum.parts.plrr: unknown; there are: accel, "),
         (
             {"plr": {}},
-            r"^curriculum.parts.plr.capacity: missing; the method by itself has that of pool.capac",
+            "^curriculum.parts.plr.curriculum: Interpolation key 'pool.capacity' not found",
         ),
         ({"target": {"share": -1}}, "^curriculum.parts.target.share=-1: input should be"),
         (
@@ -151,7 +151,10 @@ def test_the_mixture_of_thirds_asks_one_model_of_success_and_nobody_else() -> No
             r"^curriculum.shares=\[\]: list should have at least 1 item",
         ),
         ({"target": {"name": 0}}, "^curriculum.parts.target.name: unknown; there are: none$"),
-        ({"alp_gmm": {"refit": 0}}, "^curriculum.parts.alp_gmm.refit=0: input should be"),
+        (
+            {"alp_gmm": {"refit": 0}},
+            "^curriculum.parts.alp_gmm.curriculum.refit=0: input",
+        ),
         ({"target": {"filter": "no"}}, "^curriculum.parts.target.filter/no: unknown; there are"),
         ({"target": 1}, "^curriculum.parts.target=1: input should be an object"),
     ],

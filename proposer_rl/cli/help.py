@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from textwrap import fill
 
-from proposer_rl.recipes import CONFIG_FOLDER, available, comments
+from proposer_rl.recipes import available, comments
 
 USAGE = """\
 Train a Solver on a curriculum.
@@ -35,14 +35,12 @@ GROUPS = {
 NEEDS, NOTHING = "Needs: ", "nothing."
 
 
-def help_text(arguments: Sequence[str]) -> str:
-    """Returns the usage, the names in each group, including ``--config-dir``, and examples."""
-    folders = [CONFIG_FOLDER, *own_folders(arguments)]
+def help_text() -> str:
+    """Returns the usage, the names in each group and examples."""
     parts = [USAGE]
     for option, meaning in GROUPS.items():
-        group = option.strip("+=")
-        names = sorted({name for folder in folders for name in available(group, folder)})
-        listed = fill(", ".join(names), 79, initial_indent="  ", subsequent_indent="  ")
+        names = ", ".join(available(option.strip("+=")))
+        listed = fill(names, 79, initial_indent="  ", subsequent_indent="  ")
         parts.append(f"{option} {meaning}\n{listed}\n")
     return "\n".join([*parts, EXAMPLES])
 
@@ -72,12 +70,3 @@ def needs(folders: Sequence[Path]) -> dict[str, list[str]]:
                 needed = [] if text == NOTHING else [n.strip(" .") for n in text.split(",")]
                 found.setdefault(name, needed)
     return found
-
-
-def own_folders(arguments: Sequence[str]) -> Iterator[Path]:
-    """Yields the folders of configurations that a command names."""
-    option = "--config-dir"
-    for argument, following in zip(arguments, [*arguments, ""][1:], strict=True):
-        name, equals, value = argument.partition("=")
-        if name == option or argument == "-cd":
-            yield Path(value if equals else following)

@@ -12,7 +12,7 @@ def main() -> None:
     """Prints the help, or runs the command."""
     if {"--help", "-h"} & set(sys.argv[1:]):
         guard_output()
-        print(help_text(sys.argv[1:]))
+        print(help_text())
         return
     # It takes seconds to import PyTorch.
     from proposer_rl.cli.train import main as train

@@ -22,11 +22,10 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from proposer_rl.cli.errors import command, number, say
+from proposer_rl.cli.errors import command, say
 from proposer_rl.report.reading import UnreadableRun, begun, read_run
 from proposer_rl.report.runs import Run
 from proposer_rl.runs.folder import FAILURE, is_rate
-from proposer_rl.runs.process import PROGRESS
 from proposer_rl.runs.records import LONGEST_TEXT, Column, level_text, printable, small_json, words
 
 EPILOG = """\
@@ -37,6 +36,7 @@ examples:
 BLOCKS = " ▁▂▃▄▅▆▇█"
 COLOURS = {"finished": "green", "failed": "red", "unfinished": "yellow", "starting": "blue"}
 WIDTH = 16  # characters of a curve
+SECONDS = 2.0  # between two refreshes
 STOPPED = 128  # greater exit codes are of signals, after which a run can be resumed
 
 
@@ -54,7 +54,7 @@ def _run(options: argparse.Namespace) -> None:
     shown = Live(table, console=console, auto_refresh=False, screen=True)
     with suppress(KeyboardInterrupt), shown as live:
         while console.is_terminal:  # until it is closed
-            time.sleep(options.seconds)
+            time.sleep(SECONDS)
             live.update(overview(find_progress(options.folder)), refresh=True)
 
 
@@ -67,12 +67,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("folder", type=Path, help="a run's folder, or one with runs in it")
     parser.add_argument("--once", action="store_true", help="draw once and stop")
-    parser.add_argument(
-        "--seconds",
-        type=number(float, 0.1, 3600),
-        default=2.0,
-        help="between two refreshes (default: 2)",
-    )
     return parser
 
 
@@ -93,15 +87,12 @@ class Progress:
         runs: its seeds; empty if it has not measured anything yet, or failed before.
         failure: why it failed, in one line; empty if it did not.
         age: seconds since something was written.
-        activity: what it was doing then, and how long the rest takes; empty if it does not say or
-            has failed.
     """
 
     folder: Path
     runs: tuple[Run, ...]
     failure: str
     age: float
-    activity: str = ""
 
     @property
     def state(self) -> str:
@@ -122,10 +113,7 @@ def read_progress(folder: Path) -> Progress:
         runs = ()
         if not failure and (folder / "metrics.csv").is_file():
             failure = printable(str(error).removeprefix(f"{folder}: "))
-    activity = "" if failure else _doing(folder)
-    if activity and runs:
-        activity = ", ".join(filter(None, [activity, _left(runs[0])]))
-    return Progress(folder, runs, failure, _seconds_since(folder), activity)
+    return Progress(folder, runs, failure, _seconds_since(folder))
 
 
 def find_progress(folder: Path) -> list[Progress]:
@@ -145,23 +133,6 @@ def _failure(folder: Path) -> str:
         case {"message": message}:
             return printable(str(message))[:LONGEST_TEXT]
     return f"{FAILURE} cannot be read"
-
-
-def _doing(folder: Path) -> str:
-    """Returns a run's present activity; empty where it is over or the file cannot be read."""
-    match small_json(folder / PROGRESS):
-        case {"doing": str(text)}:
-            return printable(text)[:LONGEST_TEXT]
-    return ""
-
-
-def _left(run: Run) -> str:
-    """Estimates the time left from the mean speed so far; empty before the first update."""
-    if not run.updates or run.planned is None:
-        return ""
-    rest = run.last("seconds") / run.updates * (run.planned - run.updates)
-    since = time.time() - (run.folder / "metrics.csv").stat().st_mtime
-    return f"about {duration(max(rest - since, 0.0))} left"
 
 
 def _seconds_since(folder: Path) -> float:
@@ -192,10 +163,8 @@ def overview(found: Sequence[Progress]) -> RenderableType:
         )
     told = [
         Text(f"failed: {name}: {progress.failure}", style="red")
-        if progress.failure
-        else Text(f"{name}: {progress.activity}")
         for name, progress in zip(names, found, strict=True)
-        if progress.failure or progress.activity
+        if progress.failure
     ]
     states = [progress.state for progress in found]
     counts = ", ".join(f"{states.count(state)} {state}" for state in COLOURS if state in states)

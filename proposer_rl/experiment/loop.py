@@ -143,7 +143,8 @@ class Experiment:
             text = ", ".join(filter(None, [self._headline_text(), self._status.doing]))
             bar.set_postfix_str(text, refresh=errors.isatty())
 
-        with bar, self._status.of_run(self.folder.path, show):
+        self._status.show = show
+        with bar:
             if not resumed:
                 self._measure()
             while self.updates < self.schedule.updates:

@@ -142,16 +142,10 @@ def read_table(path: Path) -> Sequence[Mapping[str, Any]]:
     return read_csv(path) if path.suffix == ".csv" else read_jsonl(path)
 
 
-def write_atomically(path: Path, content: bytes, durably: bool = True) -> None:
+def write_atomically(path: Path, content: bytes) -> None:
     """Writes a file under a temporary name, renames it, and waits until it is on the disk.
 
     After an error the old file is as it was; a crash may also leave a ``.NAME.tmp``.
-
-    Args:
-        path: the file.
-        content: all of it.
-        durably: whether to wait for the disk, which is not needed for a file that is worthless
-            after a crash of the machine.
 
     Raises:
         StorageError: if it cannot be written.
@@ -159,15 +153,14 @@ def write_atomically(path: Path, content: bytes, durably: bool = True) -> None:
     temporary = path.with_name(f".{path.name}.tmp")
     with storage(path):
         try:
-            _write(temporary, "wb", content, durably)
+            _write(temporary, "wb", content)
             os.replace(temporary, path)
         except BaseException:
             # On a full disk the temporary file would take the space that is left.
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
             raise
-        if durably:
-            _sync_folder(path.parent)
+        _sync_folder(path.parent)
 
 
 @contextmanager
@@ -230,13 +223,12 @@ def _row_ends(path: Path) -> list[int]:
     return ends[1:] if path.suffix == ".csv" else ends
 
 
-def _write(path: Path, mode: str, content: bytes, durably: bool = True) -> None:
-    """Writes to a file, and waits until it is on the disk if asked to."""
+def _write(path: Path, mode: str, content: bytes) -> None:
+    """Writes to a file, and waits until it is on the disk."""
     with open(path, mode) as file:
         file.write(content)
         file.flush()
-        if durably:
-            os.fsync(file.fileno())
+        os.fsync(file.fileno())
 
 
 def _sync_folder(folder: Path) -> None:

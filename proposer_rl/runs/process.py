@@ -1,4 +1,4 @@
-"""The process of a run: its output, stop signals, the lock of its folder, and its progress."""
+"""The process of a run: its output, stop signals, the lock of its folder, and its status."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ from proposer_rl.runs.folder import storage, write_atomically
 # runs out of time. Windows has only the first two.
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1", "SIGUSR2")
 STOP_SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
-PROGRESS = "progress.json"
-EVERY = 1.0  # seconds between two writes
+EVERY = 1.0  # seconds between two reports that are shown
 
 
 class Output:
@@ -231,43 +230,30 @@ def _holder(folder: Path) -> str:
 
 
 class Status:
-    """Reports what a run is doing.
+    """Shows what a run is doing, at most once a second.
 
     Args:
         parts: number of parts in work that is reported in parts.
         clock: returns seconds.
+
+    Attributes:
+        doing: what was reported last.
+        show: is called after a report.
     """
 
     def __init__(self, parts: int = 1, clock: Callable[[], float] = time.monotonic) -> None:
         self.doing = ""
-        self._parts = parts
-        self._clock = clock
-        self._folder: Path | None = None
+        self.show: Callable[[], None] = lambda: None
+        self._parts, self._clock = parts, clock
         self._told = -EVERY
-        self._show: Callable[[], None] = lambda: None
-
-    @contextmanager
-    def of_run(self, folder: Path, show: Callable[[], None]) -> Iterator[None]:
-        """A context in which reports are written to a run's folder, and ``show`` is called."""
-        self._folder, self._show = folder, show
-        try:
-            yield
-        finally:
-            self._folder = None
-            # An error here must not hide the error that ended the run.
-            with suppress(OSError):
-                (folder / PROGRESS).unlink()
 
     def tell(self, doing: str, part: int = 0) -> None:
         """Reports what the run is doing, and how many parts of it are done, if it has parts."""
         self.doing = f"{doing} {min(part, self._parts)}/{self._parts}" if part else doing
         now = self._clock()
-        if self._folder is None or now - self._told < EVERY:
-            return
-        self._told = now
-        content = json.dumps({"doing": self.doing}).encode()
-        write_atomically(self._folder / PROGRESS, content, durably=False)
-        self._show()
+        if now - self._told >= EVERY:
+            self._told = now
+            self.show()
 
 
 def processor() -> str:

@@ -58,22 +58,6 @@ def test_several_runs_are_a_table(tmp_path: Path, capsys) -> None:
     assert "4 runs: 1 finished, 1 failed, 1 unfinished, 1 starting" in text
 
 
-def test_a_run_says_what_it_is_doing_and_how_long_the_rest_takes(tmp_path: Path, capsys) -> None:
-    """As long for each update as those so far."""
-    folder = write_run(tmp_path / "run", finished=False)
-    run = read_progress(folder).runs[0]
-    planned = json.loads((folder / "run.json").read_text()) | {"planned_updates": 5 * run.updates}
-    (folder / "run.json").write_text(json.dumps(planned))
-    text = "training the copies 37/100"
-    assert "left" not in watch(capsys, str(folder))  # it is interrupted, for all we know
-    (folder / "progress.json").write_text(json.dumps({"doing": text}))
-    doing, left = read_progress(folder).activity.split(", about ")
-    assert doing == text and left.endswith(" s left")
-    assert float(left.split()[0]) == pytest.approx(4 * run.last("seconds"), abs=30)
-    write_run(tmp_path / "other")
-    assert f"run: {text}, about" in watch(capsys, str(tmp_path))
-
-
 def test_an_unreadable_run_is_said_to_have_failed(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run")
     (folder / "metrics.csv").write_text("a,b\n1,x\n")
@@ -94,12 +78,12 @@ def test_a_file_that_gets_its_name_meanwhile_is_no_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, listed = write_run(tmp_path / "run"), os.scandir
-    temporary = folder / ".progress.json.tmp"
+    temporary = folder / ".summary.json.tmp"
 
     def renamed_after(path: Path) -> Iterator[os.DirEntry[str]]:
         temporary.write_text("{}")
         found = list(listed(path))
-        os.replace(temporary, folder / "progress.json")
+        os.replace(temporary, folder / "summary.json")
         return iter(found)
 
     monkeypatch.setattr(terminal.os, "scandir", renamed_after)

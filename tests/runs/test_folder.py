@@ -251,9 +251,6 @@ def test_a_file_gets_its_name_once_it_is_on_the_disk_and_so_does_the_name(
         ("replace", temporary, path),
         ("fsync", tmp_path, None),
     ]
-    done.clear()
-    write_atomically(path, b"for now", durably=False)
-    assert done == [("replace", temporary, path)] and path.read_bytes() == b"for now"
 
 
 def test_an_error_leaves_the_old_file_alone(
