@@ -79,8 +79,8 @@ class GymnasiumTask(Task):
         reward_scale: factor of the rewards in training; returns are reported without it.
         network: the Solver's network.
         evaluation: how the Solver is measured.
-        vectorization: ``"sync"`` steps the environments one after another, ``"async"`` in as many
-            processes as there are cores.
+        vectorization: ``"sync"`` steps the environments one after another, ``"async"`` each in a
+            process of its own.
         extra: of this package, which the environment needs; None for none.
         solver: the Solver's training.
         context: device, precision and cores.
