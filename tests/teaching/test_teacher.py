@@ -464,24 +464,6 @@ def test_a_copy_in_another_process_is_refused() -> None:
             copied(teacher)
 
 
-NO_TARGET = prl.Parameters({"gravity": (0.0, 1.0)})
-UNFIT: list[tuple[Any, Any, dict[str, Any], str]] = [
-    ("sfl", SPACE, {}, r"sfl needs a student with exact_performance: it has no exact_perf"),
-    ("robust_plr", SPACE, {}, r"robust_plr needs a student with play: it has no play\(levels, gen"),
-    ("perf_gain", SPACE, {}, "curriculum: needs .* of a task"),
-    ("target", NO_TARGET, {}, "target: missing"),
-    ("plrr", SPACE, {}, "curriculum='plrr': must be .* accel, "),
-    ("target", SPACE, {"filter": "hard"}, "filter.hard"),
-    ("target", SPACE, {"filter": {"times": 1}}, "times=1"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "space", "more", "message"), UNFIT)
-def test_what_does_not_fit_is_named(name: Any, space: Any, more: Any, message: str) -> None:
-    with pytest.raises((ArgumentError, TypeError), match=message):
-        prl.Teacher(name, space, **more)
-
-
 def solved(levels: Any) -> dict[str, Any]:
     """A student whose success falls with the number of walls."""
     success = 1 - levels["walls"] / 60
