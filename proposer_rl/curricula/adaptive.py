@@ -303,10 +303,11 @@ class AdaptiveMixture(Curriculum):
         half = torch.tensor(HALF if self._told else HALF_OF_RETURNS, dtype=torch.float64)
         bridge = (BRIDGE_AT_ONCE + skill / 2).clamp(BRIDGE_LEAST, BRIDGE_MOST)
         if self._concentrate and self._told:
-            half = SPARSE_HALF + (half - SPARSE_HALF) * dense(TARGET)
+            everywhere = dense(UNIFORM)
+            half = SPARSE_HALF + (half - SPARSE_HALF) * torch.maximum(dense(TARGET), everywhere)
             if not self._come_back:
                 seldom = ((OFTEN - solved / number) / (OFTEN - SELDOM)).clamp(0, 1)
-                c = (seldom * (1 - dense(UNIFORM))).nan_to_num(0.0)
+                c = (seldom * (1 - everywhere)).nan_to_num(0.0)
                 low, bridge = low + c * (LEAST - low), bridge + c * (MOST - bridge)
                 self._concentration = float(c)
         target = low + (HIGH - low) * self._best / (self._best + half)
@@ -361,7 +362,11 @@ class AdaptiveMixture(Curriculum):
             some = goals[start : start + number * size].view(number, size, x.shape[1])
             far = torch.cdist(some, every).square_().div_(max(x.shape[1], 1))
             for costs in far.add_(extra[few].view(number, 1, -1)):
-                chosen.append(times * start + assigned(costs))
+                block = slice(times * start, times * (start + size))
+                able = allowed[block].nonzero().flatten()
+                # The others would be left over, and an assignment among few takes less time.
+                able = able if len(able) >= size else torch.arange(times * size)
+                chosen.append(block.start + able[assigned(costs[:, able])])
                 start += size
         self._last = levels[torch.cat(chosen)]
         return self._last

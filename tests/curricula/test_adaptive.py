@@ -126,7 +126,7 @@ def by_hand(seen: list[Any], told: bool, concentrate: bool) -> list[float]:
         solved = float((weight * uniform * label).sum() / (weight * uniform).sum())
         c = min(max((0.4 - solved) / 0.2, 0), 1) * (1 - uniform_dense)
         low, q = low + c * (0.05 - low), q + c * (0.95 - q)
-        half = 0.4 - 0.3 * target_dense
+        half = 0.4 - 0.3 * max(target_dense, uniform_dense)
     t = low + (HIGH - low) * b / (b + half)
     return [t, (1 - t) * (1 - q), (1 - t) * q]
 
