@@ -40,4 +40,3 @@ from proposer_rl.teaching import TaughtEnv as TaughtEnv
 from proposer_rl.teaching import TaughtRunner as TaughtRunner
 from proposer_rl.teaching import Teacher as Teacher
 from proposer_rl.teaching import TeacherSampler as TeacherSampler
-from proposer_rl.teaching import mixed_groups as mixed_groups

@@ -13,11 +13,12 @@ import pytest
 import torch
 from PIL import Image
 
+from proposer_rl.cli.build import make_task
 from proposer_rl.streams import Streams
 from proposer_rl.task import LocatedTarget, Task
 from tests.tasks.batched_envs.toys import windy_task
 from tests.tasks.gymnasium.toys import walk_task
-from tests.tiny import mountain_cars, point_masses, sledges, tiny_task, tiny_view_task
+from tests.tiny import composed, mountain_cars, point_masses, sledges, tiny_task, tiny_view_task
 
 K, P, C, E = 2, 4, 3, 5
 
@@ -30,6 +31,9 @@ TASKS = {
     "views": tiny_view_task,
     "gates": point_masses,
     "wind": windy_task,
+    "robots": lambda: make_task(
+        composed("task=robots", "+method=target", "solver.batch_size=4", "solver.ppo.horizon=8")
+    ),
 }
 
 

@@ -190,35 +190,6 @@ def test_the_distribution_of_ncc_is_a_softmax_over_renewed_scores() -> None:
     torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
 
 
-def test_credit_goes_to_the_levels_trained_on_before() -> None:
-    """By a plain loop over batches of many sizes; one level of each batch is evicted after it."""
-    rule = {"train_on_new": True, "capacity": 8, "replay_probability": 1.0}
-    curriculum = replay("regret", co_learnability=0.5, **rule)
-    last: set[int] = set()
-    raised = 0.0
-    for number, count in enumerate([8, 5, 3, 6, 6, 1, 7]):
-        batch = curriculum.propose(c.Student(), count, Streams(0, number))
-        score = torch.rand(count, generator=Streams(0, number).generator("score"))
-        before = curriculum.buffer["score"].clone()
-        outcome = TensorDict({"return": torch.zeros_like(score), "score": score}, [count])
-        curriculum.observe(c.Student(), batch, outcome)
-        if number == 0:  # which fills the buffer
-            continue
-        assert bool(batch.notes["replayed"].all())
-        expected, slots = before.tolist(), batch.notes["slot"].tolist()
-        for slot in {*slots}:
-            told = [float(new) for new, where in zip(score, slots, strict=True) if where == slot]
-            expected[slot] = sum(told) / len(told)
-        fell = sum(float(before[slot]) - expected[slot] for slot in slots) / len(slots)
-        for slot in last:
-            expected[slot] += 0.5 * fell
-            raised += abs(fell)
-        assert curriculum.buffer["score"].tolist() == pytest.approx(expected)
-        last = {*slots[1:]} - {slots[0]}
-        curriculum.buffer["key"][slots[0]] += 1
-    assert raised > 1
-
-
 def test_the_log_is_of_the_buffer() -> None:
     told = live([accel()], solvers([0]), [0], range(7))[0].told
     assert told[0] == {}
