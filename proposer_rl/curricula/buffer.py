@@ -245,25 +245,6 @@ def rescore(
     there.scatter_reduce_(0, slots, best.to(there), "amax")
 
 
-def lineage(buffer: TensorDictBase, most: int) -> Tensor:
-    """Returns the slots of the longest chain of edits, from ancestor to descendant: int64 [m].
-
-    Args:
-        buffer: [N].
-        most: largest number of slots to return, counted from the end of the chain.
-    """
-    place = {key: slot for slot, key in enumerate(buffer["key"].tolist())}
-    parents = [place.get(key) for key in buffer["parent"].tolist()]
-    longest: list[int] = []
-    for slot in range(len(parents)):
-        line, parent = [slot], parents[slot]
-        while parent is not None and parent not in line and len(line) < most:
-            line.append(parent)
-            parent = parents[parent]
-        longest = max(longest, line, key=len)
-    return torch.tensor(longest[::-1])
-
-
 def _mean_of_slots(old: Tensor, slots: Tensor, new: Tensor) -> Tensor:
     """Returns the mean of the finite new values of each slot, or else its old value: [*B, N].
 

@@ -39,7 +39,6 @@ from proposer_rl.curricula.buffer import (
     draw_slots,
     empty_buffer,
     insert,
-    lineage,
     replay_weights,
     rescore,
 )
@@ -339,8 +338,6 @@ class ReplayCurriculum(Curriculum):
             "highest scores": buffer["score"].topk(min(SHOWN, len(buffer))).indices,
             "most replayed": buffer["draws"].topk(min(SHOWN, len(buffer))).indices,
         }
-        if self._edits:
-            shown["the longest line of edits in the buffer"] = lineage(buffer, SHOWN)
         return {caption: buffer["level"][which] for caption, which in shown.items()}
 
 

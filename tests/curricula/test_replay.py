@@ -158,14 +158,6 @@ def test_children_differ_from_their_parents_by_their_edits() -> None:
     assert found > 4
 
 
-def test_the_lineage_is_the_longest_line_of_edits() -> None:
-    buffer = buffers.empty_buffer(TASK.space.sample(1, torch.Generator())[0], 6)
-    buffer["key"] = torch.tensor([1, 2, 3, 4, 5, 6])
-    buffer["parent"] = torch.tensor([3, 0, 2, 1, 99, 5])  # 2 > 3 > 1 > 4, and 5 > 6
-    buffer["generation"] = torch.tensor([2, 0, 1, 3, 7, 8])
-    assert buffers.lineage(buffer, 6).tolist() == [1, 2, 0, 3]
-
-
 def test_easy_parents_are_those_of_the_lowest_return_minus_loss() -> None:
     learner = solvers([0])
     (lived,) = live([replay()], learner, [0], range(1))
@@ -200,7 +192,7 @@ def test_the_distribution_of_ncc_is_a_softmax_over_renewed_scores() -> None:
 
 def test_what_is_logged_shows_levels() -> None:
     told = live([accel()], solvers([0]), [0], range(7))[0].told
-    assert told[0] == {} and set(told[-1]["levels"]) > {"highest scores", "most replayed"}
+    assert told[0] == {} and set(told[-1]["levels"]) == {"highest scores", "most replayed"}
     assert all(TASK.record(some, None) for some in told[-1]["levels"].values())
     assert told[-1]["replayed"] == 1 and 1 <= told[-1]["effective_levels"] <= 16
 
