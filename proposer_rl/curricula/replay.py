@@ -56,7 +56,6 @@ Edit = Callable[[Levels, int, Sequence[torch.Generator]], Levels]
 Parents = Literal["batch", "easy"]
 
 EASY = 4  # parents of a batch of children, unless all of the batch are
-SHOWN = 6  # levels of each kind in a report
 
 
 class ReplayCurriculum(Curriculum):
@@ -216,7 +215,6 @@ class ReplayCurriculum(Curriculum):
             "effective_levels": float(1 / shares.square().sum()),
             "mean_score": float(buffer["score"].where(filled, 0).sum() / count),
             "mean_generation": float(buffer["generation"].where(filled, 0).sum() / count),
-            "levels": self._shown(),
         }
         if len(self._last):
             record["distinct_levels"] = len(level_keys(self._last).unique())
@@ -330,15 +328,6 @@ class ReplayCurriculum(Curriculum):
     def _fresh(self, count: int, rng: Streams, *purpose: str | int) -> Levels:
         """Draws new levels [count] on the CPU."""
         return moved(self._new_levels.sample(count, rng.generator(*purpose)), CPU)
-
-    def _shown(self) -> dict[str, Levels]:
-        """Returns levels of the buffer to show in reports, by caption."""
-        buffer = self.buffer[self.buffer["filled"]]
-        shown = {
-            "highest scores": buffer["score"].topk(min(SHOWN, len(buffer))).indices,
-            "most replayed": buffer["draws"].topk(min(SHOWN, len(buffer))).indices,
-        }
-        return {caption: buffer["level"][which] for caption, which in shown.items()}
 
 
 def parents_among(evidence: TensorDictBase) -> Tensor:
