@@ -12,7 +12,7 @@ NAMES = {
     "intervals": "how often intervals over few seeds hold what they are of",
     "slurm": "runs under a real Slurm of one node: time-outs, preemption, scancel",
     "prompts": "curricula of prompts for tiny language models, at equal rollouts",
-    "loops": "curricula in training loops of TorchRL's stock parts",
+    "loops": "curricula in training loops of stock parts",
     "scores": "finished runs on further levels, as a table of methods",
     "pages": "the pages of a study: which curriculum to use, and which claims hold",
 }

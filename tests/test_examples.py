@@ -23,7 +23,7 @@ from proposer_rl.cli.report import main as report
 from proposer_rl.cli.watch import main as watch
 from proposer_rl.meta.rewards import TrainingStep
 from proposer_rl.play.session import Drawn, OfCurriculum
-from proposer_rl.report.figures import along_training
+from proposer_rl.report.figures import learning_curves
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
 from tests.commands import SMOKE, trained_run
@@ -89,8 +89,8 @@ def test_the_shortest_task_has_every_command(
     drawn = Drawn(source="distribution", name="target", seed=3, checkpoint=1, solver=1)
     for shown in (session.levels(drawn), session.levels(OfCurriculum(source="curriculum", row=0))):
         assert all(level["picture"] and "wind" in level["text"][1] for level in shown["levels"])
-    monkeypatch.setattr("proposer_rl.report.build.DRAWINGS", [along_training])
-    report([str(run), "-q", "-o", str(tmp_path / "report")])
+    monkeypatch.setattr("proposer_rl.report.build.DRAWINGS", [learning_curves])
+    report([str(run), "-o", str(tmp_path / "report")])
     assert "Sledges of that batch" in (tmp_path / "report" / "report.html").read_text("utf-8")
 
 

@@ -173,11 +173,9 @@ def test_evaluation_levels_are_the_same_in_every_run(task: Task) -> None:
 def test_facts_say_what_readers_need(task: Task) -> None:
     facts = json.loads(json.dumps(task.facts))
     assert facts.keys() - {"text_key"} == {
-        "title", "levels", "distributions", "space", "about", "key", "measured", "samples",
-        "exact",
+        "title", "levels", "distributions", "space", "about", "key", "measured", "exact",
     }  # fmt: skip
     for name in facts["distributions"]:
         assert f"{name}_success" in task.metrics
-        assert all("picture" in record for record in facts["samples"][name])
     assert list(facts["space"]) == list(task.space.axes)
     assert facts == json.loads(json.dumps(task.facts))

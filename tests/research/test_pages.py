@@ -27,7 +27,7 @@ from research.generalisation import (
     read_scores,
     write_scores,
 )
-from research.pages import CHOICE, CLAIMS, main
+from research.pages import CHOICE, CLAIMS, difficulty, main
 from research.ranking import EXACT, STEADY, budgets, choices, needs_of
 from research.timing import read_timing, timed
 from tests.report.folders import TASK, cycle, write_rockets, write_run, write_seconds
@@ -425,3 +425,14 @@ def test_performance_that_is_played_is_no_exact_evaluation(tmp_path: Path) -> No
         write_run(tmp_path / str(exact), "mine", task=task)
         (study,), _ = read_studies([tmp_path / str(exact)], None)
         assert (EXACT in needs_of(study.groups[0], {})) == exact
+
+
+def test_a_legend_has_the_methods_that_are_drawn(tmp_path: Path) -> None:
+    """Not those whose runs keep no levels, or no table of what the Solver trained on."""
+    write_run(tmp_path / "full", "target", levels=[0.5])
+    write_run(tmp_path / "bare", "plr")
+    (tmp_path / "bare" / "training.csv").unlink()
+    study = read_studies([tmp_path / "full", tmp_path / "bare"], None)[0][0]
+    assert set(study.legend) == {"target", "plr"}
+    drawing = difficulty(study)
+    assert drawing is not None and drawing.legend == {"target": study.legend["target"]}
