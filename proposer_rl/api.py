@@ -58,7 +58,6 @@ from proposer_rl.teaching import (
     TaughtRunner,
     Teacher,
     TeacherSampler,
-    mixed_groups,
 )
 
 if TYPE_CHECKING:
@@ -120,7 +119,6 @@ __all__ = [
     "curricula",
     "generate_levels",
     "log_success_gain",
-    "mixed_groups",
     "outcome_of",
     "performance_gain",
     "shortest_path_length",

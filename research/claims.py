@@ -204,7 +204,8 @@ def _grow_harder(study: Study) -> Evidence | None:
     for group in study.compared:
         like = group.runs[0]
         known = [change for run in group.logs if (change := _change(run, like)) is not None]
-        if not group.proposes or not known:
+        proposes = any("total_reward" in cycle for run in group.runs for cycle in run.cycles)
+        if not proposes or not known:
             continue
         early, late = np.mean(known, 0)
         changes = [mean_of(values) for values in np.diff(known, axis=1)[:, 0].T]

@@ -11,9 +11,10 @@ from pathlib import Path
 from proposer_rl.cli.errors import command, number
 from proposer_rl.cli.help import needs
 from proposer_rl.recipes import CONFIG_FOLDER
-from proposer_rl.report import figures, page
+from proposer_rl.report import figures, measures, page
 from proposer_rl.report.build import FIGURES, check_output, read_checked
 from proposer_rl.report.comparisons import primary
+from proposer_rl.report.measures import UPDATES
 from proposer_rl.report.reading import OutputError
 from proposer_rl.report.runs import STUDY
 from proposer_rl.report.statistics import FEWEST, INTERVALS
@@ -40,12 +41,56 @@ from research.timing import read_timing, timed
 CHOICE, CLAIMS = "which_curriculum.md", "claims.md"
 SCARCE = ("updates of the Solver", "environment frames", "seconds")
 
+
+def cost_curves(study: Study) -> Drawing:
+    """Draws the headline against updates and against costs, including those of the curriculum."""
+    measure = measures.measured(study)[study.headline]
+    seconds = (
+        "Seconds are of the whole process, including evaluation, or an even share where seeds were "
+        "trained together. Compare them only between runs on equal machines."
+    )
+    if study.timed:
+        seconds = (
+            "Seconds are updates times the seconds of one, with all methods timed in turns on one "
+            f"machine ({study.timed}) and without evaluations."
+        )
+    return Drawing(
+        "cost",
+        f"The same {words(study.headline)} against updates and against its whole cost",
+        "Frames are the Solver's own and those that the curriculum spent on replicas or scoring. "
+        + seconds,
+        [
+            partial(figures.draw_curves, study=study, measure=measure, axis=axis)
+            for axis in measure.axes
+        ],
+        3,
+        study.legend,
+    )
+
+
+def difficulty(study: Study) -> Drawing | None:
+    """Draws statistics of the levels trained on; None where no run has recorded any."""
+    every = measures.trained(study)
+    shown = [g for g in study.groups if any(each.axes[UPDATES](g) is not None for each in every)]
+    if not shown:
+        return None
+    return Drawing(
+        "difficulty",
+        "What the Solver trained on",
+        "Statistics of the batch at each evaluated update: means, or standard deviations where the "
+        "name says sd. Lines and bands are as above.",
+        [partial(figures.draw_curves, study=study, measure=measure) for measure in every],
+        3,
+        {group.label: group.look for group in shown},
+    )
+
+
 # Of the page of claims.
 DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
     figures.learning_curves,
-    figures.cost_curves,
+    cost_curves,
     figures.heat_maps,
-    figures.difficulty,
+    difficulty,
 )
 
 
@@ -103,7 +148,7 @@ def _choice(
         f"From {_runs(study)}. By what is available, and by what is scarce: the method with the "
         f"highest mean over seeds of {words(study.headline)} along training, over a "
         "budget of it; its median is shown.",
-        _picture(figures.cost_curves(shown)._replace(name="recommended"), files),
+        _picture(cost_curves(shown)._replace(name="recommended"), files),
         _decision_table(found),
         _budgets(study),
     ]

@@ -54,8 +54,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.timeout(3600))
     # First what lasts longest, so that no process waits at the end for another's; they share one
     # process that forks.
-    long = {"processes", "call_there"}
-    first = {item.path for item in items if long & {*getattr(item, "fixturenames", ())}}
+    first = {item.path for item in items if "processes" in getattr(item, "fixturenames", ())}
     items.sort(key=lambda item: item.path not in first)
 
 

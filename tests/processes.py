@@ -7,7 +7,6 @@ since threads do not survive a fork.
 
 from __future__ import annotations
 
-import ctypes
 import faulthandler
 import fcntl
 import gc
@@ -32,8 +31,6 @@ from tqdm import tqdm
 from proposer_rl.runs.process import PROGRESS
 
 ROOT = Path(__file__).resolve().parents[1]
-CAPABILITIES_VERSION = 0x20080522  # capget(2)
-CAP_DAC_OVERRIDE = 1
 LONGEST = 200  # seconds; a child that takes longer hangs: it shows where, and ends
 
 
@@ -61,7 +58,6 @@ class Request:
         signal_at: {index of a write: signal}: before that write the child sends itself a signal. If
             it is SIGKILL and the write is the fsync of a new checkpoint, half of that is there.
         largest_file: bytes; RLIMIT_FSIZE.
-        as_anyone: give up root's right to write where permissions forbid it.
         lost_at: index of the write before which nobody reads any more what it says, neither its
             standard output nor its errors. It is a pipe's other end that is closed.
         terminal: it is a terminal that is closed, which hangs up: SIGHUP.
@@ -73,7 +69,6 @@ class Request:
     signals: list[tuple[float, int]] = field(default_factory=list)
     signal_at: dict[int, int] = field(default_factory=dict)
     largest_file: int | None = None
-    as_anyone: bool = False
     lost_at: int | None = None
     terminal: bool = False
     ignored: list[int] = field(default_factory=list)
@@ -212,8 +207,6 @@ def _become_child(request: Request, said: int, counted: int) -> None:
         if request.largest_file is not None:
             limit = (request.largest_file, request.largest_file)
             resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-        if request.as_anyone:
-            _give_up_override()
         tqdm.set_lock(RLock())  # its own would be shared with other processes
         sys.argv = ["proposer-train", *request.arguments]
         train.main()
@@ -256,16 +249,6 @@ def _note_writes(signal_at: dict[int, int], lost_at: int | None, noted: int) -> 
 
     for name in originals:
         setattr(os, name, lambda *arguments, name=name: call(name, *arguments))
-
-
-def _give_up_override() -> None:
-    """Let permissions count for root too: no CAP_DAC_OVERRIDE in the effective set."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    header = (ctypes.c_uint32 * 2)(CAPABILITIES_VERSION, 0)
-    sets = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable; low words, then high
-    assert libc.capget(header, sets) == 0
-    sets[0] &= ~(1 << CAP_DAC_OVERRIDE)
-    assert libc.capset(header, sets) == 0
 
 
 if __name__ == "__main__":

@@ -21,7 +21,6 @@ import proposer_rl
 from proposer_rl.cli.groups import quoted
 from proposer_rl.experiment import Experiment
 from proposer_rl.recipes import CONFIG_FOLDER
-from proposer_rl.runs.checkpoint import load_latest
 from proposer_rl.runs.folder import read_csv, read_jsonl
 from proposer_rl.runs.process import Interrupted
 from tests.commands import SMOKE, trained_run
@@ -81,14 +80,6 @@ def test_a_frozen_proposer_sees_what_it_has_learnt_with(train, capsys) -> None:
     assert train(*arguments, "proposer.observes=[return,progress]") == 2
     said = "checkpoint=learnt: its Proposer has learnt with observes=['log_success', 'progress']"
     assert said in capsys.readouterr().err
-    assert train(*arguments, "schedule.updates=1") == 0
-    # The checkpoint moves on, and the Proposer that this run began with does not.
-    began = load_latest(Path("run/checkpoints"))[1]["curricula"][0]["proposer"]
-    assert train("+method=perf_gain", *SMOKE, "hydra.run.dir=learnt", "schedule.updates=4") == 0
-    assert train(*arguments, "schedule.updates=2") == 0
-    ended = load_latest(Path("run/checkpoints"))[1]["curricula"][0]["proposer"]
-    for name, entry in began.items():
-        assert torch.equal(entry["value"], ended[name]["value"])
 
 
 @pytest.mark.parametrize("method", ["perf_gain", "first_order_proposer"])
@@ -221,26 +212,26 @@ def test_an_unforeseen_error_within_a_run_is_no_bad_input_and_none_of_the_disk(
 
 
 @pytest.mark.parametrize(
-    ("function", "place"),
+    ("function", "place", "number"),
     [
-        ("hydra.core.utils._save_config", "run"),
-        ("proposer_rl.cli.watch.draw_run", "run"),
-        ("logging.FileHandler._open", "run/train.log"),
+        ("hydra.core.utils._save_config", "run", errno.EACCES),
+        ("proposer_rl.cli.watch.draw_run", "run", errno.ENOSPC),
+        ("logging.FileHandler._open", "run/train.log", errno.EFBIG),
     ],
 )
-def test_a_disk_that_takes_no_more_is_named_with_its_folder(
-    function: str, place: str, train, monkeypatch, capsys
+def test_a_disk_that_cannot_be_written_to_is_named_with_its_folder(
+    function: str, place: str, number: int, train, monkeypatch, capsys
 ) -> None:
     """Whoever writes: Hydra, logging or matplotlib, which do not say where."""
 
     def full(*_: object, **__: object) -> None:
         named = [str(Path("run/train.log").absolute())] if place != "run" else []
-        raise OSError(errno.EFBIG, "File too large", *named)
+        raise OSError(number, os.strerror(number), *named)
 
     monkeypatch.setattr(function, full)
     assert train(*COMMAND) == 4
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line == f"error: cannot use {Path(place).absolute()}: File too large"
+    assert line == f"error: cannot use {Path(place).absolute()}: {os.strerror(number)}"
 
 
 def test_a_run_goes_on_in_the_precision_that_it_began_with(
@@ -257,9 +248,3 @@ def test_a_run_goes_on_in_the_precision_that_it_began_with(
     assert train(*longer, "precision=fp32", "schedule.updates=6") == 2
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert error.startswith("error: precision='fp32': the run in") and "'fp8'" in error
-
-
-def test_a_failing_run_of_a_multirun_does_not_take_the_others_with_it(train, capsys) -> None:
-    assert train("-m", "+method=target", "solver.batch_size=0,4", *FEW) == 2
-    assert "solver.batch_size=0: input should be" in capsys.readouterr().err
-    assert len(list(Path().glob("multirun/*/*/summary.json"))) == 1

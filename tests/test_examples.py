@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,10 +17,16 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 import proposer_rl as prl
+from proposer_rl.cli.eval import main as evaluate
+from proposer_rl.cli.play import open_session
+from proposer_rl.cli.report import main as report
+from proposer_rl.cli.watch import main as watch
 from proposer_rl.meta.rewards import TrainingStep
+from proposer_rl.play.session import Drawn, OfCurriculum
+from proposer_rl.report.figures import learning_curves
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.streams import Streams
-from tests.commands import SMOKE
+from tests.commands import SMOKE, trained_run
 from tests.curricula.test_contract import same
 
 ROOT = Path(__file__).parents[1]
@@ -51,6 +58,40 @@ def test_each_says_what_it_shows_and_is_listed(name: str) -> None:
     assert text.startswith('"""') and started in docstring
     pages = (ROOT / "docs/how_to" / f"{page}.md" for page in ("own_parts", "own_loop"))
     assert any(name in page.read_text(encoding="utf-8") for page in pages)
+
+
+def test_the_shortest_task_has_every_command(
+    example: Load,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    run = trained_run(
+        tmp_path / "run",
+        *("--config-dir", f"{EXAMPLES}/conf", "task=own_task", "+method=domain_randomization"),
+        *("compute.progress=false", "schedule.updates=4", "task.levels=8", "solver.batch_size=4"),
+        *("seeds=[0,1]", "solver.ppo.horizon=10"),
+    )
+    measured = read_csv(run / "metrics.csv")[-1]
+    assert {"target_success", "target_return", "all_success"} <= measured.keys()
+    trained = read_csv(run / "training.csv")[-1]
+    assert 1 <= trained["distance"] <= 9 and 0 <= trained["wind"] <= 1
+    watch([str(run), "--once"])
+    assert "target success" in capsys.readouterr().out
+    evaluate([str(run), "--levels", "all", "-o", str(tmp_path / "rows.json")])
+    rows = json.loads((tmp_path / "rows.json").read_text())
+    assert len(rows) == 2 * 8 and all(0 <= row["success"] <= 1 for row in rows)
+    with pytest.raises(SystemExit):
+        evaluate([str(run), "--levels", "here"])
+    assert "--levels here: must be one of: target, all" in capsys.readouterr().err
+    session = open_session(run)
+    assert session.about()["board"] is None and session.about()["task_levels"] == "sledges"
+    drawn = Drawn(source="distribution", name="target", seed=3, checkpoint=1, solver=1)
+    for shown in (session.levels(drawn), session.levels(OfCurriculum(source="curriculum", row=0))):
+        assert all(level["picture"] and "wind" in level["text"][1] for level in shown["levels"])
+    monkeypatch.setattr("proposer_rl.report.build.DRAWINGS", [learning_curves])
+    report([str(run), "-o", str(tmp_path / "report")])
+    assert "Sledges of that batch" in (tmp_path / "report" / "report.html").read_text("utf-8")
 
 
 def test_the_mountain_car_is_gymnasiums(example: Load) -> None:

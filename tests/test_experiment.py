@@ -286,16 +286,6 @@ def test_a_longer_schedule_goes_on_as_if_it_had_been_so_long_from_the_start(
     assert rows[0] == rows[1]
 
 
-def test_levels_that_a_curriculum_shows_are_recorded(tmp_path: Path) -> None:
-    class Shows(SamplingCurriculum):
-        def log(self) -> dict:
-            return {"levels": {"some": TASK.target.sample(2, Streams(0).generator())}}
-
-    experiment(tmp_path, 0, curriculum=Shows(TASK.target)).run()
-    for row in read_jsonl(tmp_path / "cycles.jsonl"):
-        assert len(row["levels"]["some"]) == 2 and "picture" in row["levels"]["some"][0]
-
-
 class Stopped(Costly):
     """A signal comes in the middle of its second improvement."""
 

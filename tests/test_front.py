@@ -114,7 +114,7 @@ def test_a_run_in_a_maze_is_that_of_the_command_line(
     assert "6/6" in capsys.readouterr().out
     evaluate([str(run.folder), "--levels", "id", "-o", str(tmp_path / "rows.json")])
     monkeypatch.setattr("proposer_rl.report.build.DRAWINGS", [])
-    report([str(run.folder), "-q", "-o", str(tmp_path / "report")])
+    report([str(run.folder), "-o", str(tmp_path / "report")])
     assert (tmp_path / "report" / "report.html").exists()
     assert open_session(run.folder).about()["board"] is not None
 

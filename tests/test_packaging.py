@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import ast
-import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
 import tomllib
 import zipfile
-from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,9 +18,9 @@ from typing import NamedTuple
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
-from proposer_rl.recipes import available
-from tests import minimal
 from tests.test_bin import MODULES
 from tests.test_readme import README, blocks
 
@@ -64,75 +63,91 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
     return Built(archive, wheel, source, folder / "site")
 
 
-# Each extra that a method, a task or a command names; the empty one is none.
-NAMED = ["", "alp-gmm", "box2d", "minigrid", "mujoco", "play", "tensorboard"]
+def interpreter(version: str) -> str | None:
+    """The path of an interpreter of a version, such as "3.12", that can make environments."""
+    installed = sorted(Path.home().glob(f".pyenv/versions/{version}.*/bin/python"))
+    ours = sys.executable if sys.version.startswith(f"{version}.") else None
+    for python in filter(None, [ours, shutil.which(f"python{version}"), *map(str, installed)]):
+        tried = [python, "-c", "import ensurepip, venv"]
+        if subprocess.run(tried, check=False, capture_output=True).returncode == 0:
+            return python
+    return None
 
 
-@pytest.fixture(scope="module")
-def call_there(
-    built: Built, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Callable[[str, Path], int]]:
-    """Calls the commands with an extra, in a folder; returns the exit code."""
-    kept = {name: os.environ[name] for name in ("PATH", "HOME") if name in os.environ}
-    with subprocess.Popen(
-        [sys.executable, "-I", minimal.__file__, built.site, json.dumps(NAMED)],
-        cwd=tmp_path_factory.mktemp("elsewhere"),
-        env=kept | {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"},
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-        assert process.stdin is not None and process.stdout is not None
-        asked, answers = process.stdin, process.stdout
-
-        def there(extra: str, folder: Path) -> int:
-            asked.write(json.dumps([extra, str(folder)]) + "\n")
-            asked.flush()
-            return int(answers.readline())
-
-        yield there
-        asked.close()
+def pip(folder: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Calls the pip of an environment."""
+    return subprocess.run(
+        [folder / "bin" / "python", "-m", "pip", "--disable-pip-version-check", *arguments],
+        cwd=folder, capture_output=True, text=True, check=False,
+    )  # fmt: skip
 
 
-@pytest.mark.parametrize("extra", NAMED, ids=[extra or "none" for extra in NAMED])
-def test_everything_runs_where_only_what_it_requires_is_installed(
-    extra: str, call_there: Callable[[str, Path], int], tmp_path: Path
-) -> None:
-    """The tests' tools are not there: what imports one of them, or expects it, fails here alone."""
-    code = call_there(extra, tmp_path)
-    said = (tmp_path / "output").read_text(encoding="utf-8")
-    assert code == 0, said[-5000:]
-    done = [line.split()[1:] for line in said.splitlines() if line.startswith("DID ")]
-    assert done == list(minimal.commands(extra))
+def closure(project: metadata.Distribution, extra: str) -> set[str]:
+    """Names of all distributions that one requires, and those require, with their extras."""
+    found: set[tuple[str, str]] = set()
+
+    def follow(distribution: metadata.Distribution, extras: set[str]) -> None:
+        for line in distribution.requires or []:
+            requirement = Requirement(line)
+            for asked in {"", *extras}:
+                marker = requirement.marker
+                if marker is not None and not marker.evaluate({"extra": asked}):
+                    continue
+                name = canonicalize_name(requirement.name)
+                new = {(name, inner) for inner in {"", *requirement.extras}} - found
+                if new:
+                    found.update(new)
+                    follow(metadata.distribution(name), set(requirement.extras))
+
+    follow(project, {extra} - {""})
+    return {name for name, _ in found}
 
 
 # What comes with the loop that is taught, or with a logger that the tests do without.
 BROUGHT = {"stable_baselines3", "transformers", "wandb"}
+EXTRAS = "alp-gmm", "box2d", "minigrid", "mujoco", "play", "ray", "tensorboard"
+# What is loaded by those alone who have the extra.
+OPTIONAL = {"play.server", "tasks.gymnasium.stumps", "teaching.sb3", "teaching.trl"}
 
 
-def test_whatever_it_imports_anywhere_is_required(built: Built) -> None:
-    """By itself or an extra; also in functions that no run calls."""
+def imported(tree: ast.AST, functions: bool) -> set[str]:
+    """Modules that a file imports; without those of functions, what loading the file needs."""
+    found: set[str] = set()
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            found |= {str(node.module), *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif functions or not (
+            isinstance(node, ast.FunctionDef)
+            or (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
+        ):
+            found |= imported(node, functions)
+    return found
+
+
+def test_whatever_it_imports_is_required(built: Built) -> None:
+    """Without an extra where files are loaded; with some extra in functions, too."""
     (project,) = metadata.distributions(path=[str(built.site)])
-    required = {name for extra in [*NAMED, "ray"] for name in minimal.closure(project, extra)}
-    _, owners = minimal.installed()
-    known = {"proposer_rl", *sys.stdlib_module_names, *BROUGHT}
-    known |= {top.removesuffix(".py") for top in owners if owners[top] & required}
+    owners = metadata.packages_distributions()
+
+    def known(*extras: str) -> set[str]:
+        required = {name for extra in extras for name in closure(project, extra)}
+        found = {top for top in owners if required & {*map(canonicalize_name, owners[top])}}
+        return {"proposer_rl", *sys.stdlib_module_names} | found
+
+    def tops(modules: set[str]) -> set[str]:
+        return {module.partition(".")[0] for module in modules}
+
+    alone, extras = known(""), known("", *EXTRAS)
     for file in (ROOT / "proposer_rl").rglob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            if isinstance(node, ast.ImportFrom) and not node.level:
-                names = [str(node.module)]
-            assert {name.partition(".")[0] for name in names} <= known, file
-
-
-def test_every_task_and_command_is_called() -> None:
-    called = [words for extra in NAMED for words in minimal.commands(extra)]
-    words = {word for command in called for word in command}
-    # Of view mazes the smallest; gymnasium and batched are what others are made of; maze is given.
-    tasks = set(available("task"))
-    tasks -= {"maze", "gymnasium", "batched", "view_maze", "view_maze_quick"}
-    assert {f"task={task}" for task in tasks} <= words
-    assert {f"proposer-{name}" for name, *_ in called} == PROJECT["scripts"].keys()
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        assert tops(imported(tree, functions=True)) <= extras | BROUGHT, file
+        name = ".".join(file.relative_to(ROOT / "proposer_rl").with_suffix("").parts)
+        if name not in OPTIONAL:
+            loaded = imported(tree, functions=False)
+            assert tops(loaded) <= alone, file
+            assert not loaded & {f"proposer_rl.{other}" for other in OPTIONAL}, file
 
 
 def test_a_wheel_holds_the_package_and_its_configuration(built: Built) -> None:
@@ -189,24 +204,24 @@ def test_pip_installs_it_in_a_new_environment(
     python: str, kind: str, built: Built, tmp_path: Path
 ) -> None:
     """Outside of the checkout, with the versions of constraints.txt."""
-    found = minimal.interpreter(python)
+    found = interpreter(python)
     if found is None:
         pytest.skip(f"there is no Python {python} that can make an environment")
     with TemporaryDirectory() as name:  # a gigabyte and more, which pytest would keep
         folder = Path(name)
         subprocess.run([found, "-m", "venv", folder], check=True)
         (torch,) = re.findall("^torch==.*$", CONSTRAINTS.read_text(), re.MULTILINE)
-        here = minimal.pip(folder, "install", "--dry-run", "--no-deps", "--no-index", torch)
+        here = pip(folder, "install", "--dry-run", "--no-deps", "--no-index", torch)
         if here.returncode:
             pytest.skip(f"no {torch} for Python {python} lies where pip finds links")
         (project,) = metadata.distributions(path=[str(built.site)])
         required = [line for line in project.requires or [] if "extra ==" not in line]
-        done = minimal.pip(folder, "install", "-q", "-c", CONSTRAINTS, torch, *required)
+        done = pip(folder, "install", "-q", "-c", CONSTRAINTS, torch, *required)
         if done.returncode:
             pytest.skip(f"pip cannot install what it requires: {done.stderr.splitlines()[-1]}")
-        done = minimal.pip(folder, "install", "-q", "-c", CONSTRAINTS, getattr(built, kind))
+        done = pip(folder, "install", "-q", "-c", CONSTRAINTS, getattr(built, kind))
         assert done.returncode == 0, done.stderr
-        assert minimal.pip(folder, "check").returncode == 0
+        assert pip(folder, "check").returncode == 0
         lines = "\n".join(block for block in blocks("python", README) if "prl.Teacher(" in block)
         assert lines
         (tmp_path / "loop.py").write_text(f"import proposer_rl as prl\n{lines}")

@@ -217,38 +217,6 @@ def test_a_full_disk_ends_the_run_and_leaves_the_checkpoint_before(
     assert_same_run(whole[0], run)
 
 
-@pytest.mark.parametrize("sealed", [".", "checkpoints"])
-def test_a_folder_that_may_not_be_written_to(
-    sealed: str, whole: tuple[Path, Ended], processes: Processes, run: Path
-) -> None:
-    command = [*TRAIN, f"hydra.run.dir={run}"]
-    before = checkpoints(run)
-    # A folder that is left as it is may still hold files that can be written to.
-    (run / ".hydra" / "config.yaml").chmod(0o444)
-    (run / sealed).chmod(0o555)
-    try:
-        refused = processes(*command, as_anyone=True)
-    finally:
-        (run / sealed).chmod(0o755)
-        (run / ".hydra" / "config.yaml").chmod(0o644)
-    assert refused.code == 4
-    assert refused.output.startswith("error: cannot ") and "Permission denied" in refused.output
-    assert len(refused.output.strip().splitlines()) == 1
-    assert checkpoints(run) == before
-    assert processes(*command).code == 0
-    assert_same_run(whole[0], run)
-
-
-def test_no_permission_to_make_the_folder(processes: Processes, tmp_path: Path) -> None:
-    tmp_path.chmod(0o555)
-    try:
-        refused = processes(*TRAIN, f"hydra.run.dir={tmp_path / 'run'}", as_anyone=True)
-    finally:
-        tmp_path.chmod(0o755)
-    assert refused.code == 4
-    assert refused.output == f"error: cannot use {tmp_path / 'run'}: Permission denied\n"
-
-
 def test_numbers_that_go_wrong_end_the_run_and_the_last_good_checkpoint_stays(
     whole: tuple[Path, Ended], processes: Processes, tmp_path: Path
 ) -> None:

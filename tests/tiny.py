@@ -18,6 +18,7 @@ from proposer_rl.learning import PPO, PPOSettings, SolverSettings
 from proposer_rl.models import ActorCritic, cell_logits
 from proposer_rl.streams import Streams
 from proposer_rl.task import ComputeContext, Task
+from proposer_rl.tasks.batched_envs import BatchedTask
 from proposer_rl.tasks.gymnasium.networks import NetworkSettings
 from proposer_rl.tasks.mazes import Level, planes
 from proposer_rl.tasks.mazes.evaluation import ExactEvaluator
@@ -29,7 +30,6 @@ from proposer_rl.tasks.mazes.task import (
     SpaceSettings,
     UNetSettings,
 )
-from proposer_rl.tasks.point_masses import GateSettings, PointMassTask
 from proposer_rl.tasks.ranges import RangeSettings
 from proposer_rl.tasks.view_mazes.task import ViewEvaluationSettings, ViewMazeSettings, ViewMazeTask
 from proposer_rl.tasks.view_mazes.view_env import ViewNetworkSettings
@@ -78,12 +78,14 @@ mountain_cars = partial(example_task, "mountain_car", "MountainCarTask")
 sledges = partial(example_task, "own_task", "SledgeTask")
 
 
-def point_masses(**changed: Any) -> PointMassTask:
+def point_masses(**changed: Any) -> BatchedTask:
     """SPDL's gates, in 8 x 5 x 2 bins, before which episodes are short."""
     position = {"distribution": "norm", "loc": 2.5, "scale": 0.004}
     parts: dict[str, Any] = dict(
+        env="proposer_rl.tasks.point_masses.PointMassEnv",
         max_steps=8,
-        parameters=GateSettings(
+        seeded=False,
+        parameters=dict(
             position=RangeSettings(low=-4.0, high=4.0, bins=8, target=position),
             width=RangeSettings(low=0.5, high=8.0, bins=5, target=0.5),
             friction=RangeSettings(low=0.0, high=4.0, bins=2, target=0.0),
@@ -93,7 +95,7 @@ def point_masses(**changed: Any) -> PointMassTask:
         solver=SolverSettings(batch_size=4, ppo=PPOSettings(horizon=8, epochs=2)),
         context=ComputeContext(),
     )
-    return PointMassTask(**{**parts, **changed})
+    return BatchedTask(**{**parts, **changed})
 
 
 def tiny_view_task(**changed: Any) -> ViewMazeTask:

@@ -12,7 +12,7 @@ from typing import Any
 from proposer_rl.cli.config import LoggerSettings
 from proposer_rl.experiment import Log
 from proposer_rl.runs.folder import write_atomically
-from proposer_rl.runs.records import batch_shares, numbers
+from proposer_rl.runs.records import flat
 
 ID = "wandb_id.txt"
 
@@ -35,7 +35,7 @@ def logger(
     with opened as write:
 
         def log(table: str, row: Mapping[str, Any], step: int) -> None:
-            write({f"{table}/{key}": value for key, value in _numbers(row)}, step)
+            write({f"{table}/{key}": value for key, value in flat(row).items()}, step)
 
         yield log
 
@@ -93,15 +93,3 @@ def wandb_id(path: Path) -> str:
     if not file.is_file():
         write_atomically(file, secrets.token_hex(4).encode())
     return file.read_text(encoding="utf-8-sig").strip()
-
-
-def _numbers(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    """Yields the numbers of a row, the maximum and mean of its lists, and its batch shares."""
-    for key, value in row.items():
-        if isinstance(value, int | float):
-            yield key, value
-        elif (found := numbers(value)) is not None:
-            yield f"{key}_max", float(found.max())
-            yield f"{key}_mean", float(found.mean())
-    for name, share in batch_shares(row).items():
-        yield f"shares/{name}", share

@@ -54,7 +54,6 @@ def _run(options: argparse.Namespace) -> None:
         options.folder,
         options.output,
         *asked,
-        progress=not options.quiet,
         meanings={group: choices(group, [CONFIG_FOLDER]) for group in ("method", "ablation")},
     )
     print(printable(f"Report: {page}"))
@@ -103,7 +102,6 @@ def _parser() -> argparse.ArgumentParser:
         help="the methods whose comparison was planned, as the report calls them: p-values are "
         "corrected for these alone (default: for all methods)",
     )
-    parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
     return parser
 
 

@@ -29,15 +29,16 @@ deviation of the returns of failures over that of all returns, in units of DENSE
 
     c = clamp((OFTEN - u) / (OFTEN - SELDOM), 0, 1) (1 - d of uniform levels).
 
-With ``concentrate``, c moves the bridge's part q to MOST, its candidates to MANY times as many,
-``delta`` to MASTERED and ``low`` to LEAST. Where levels come back one by one, c is 0: there are few
-of them near to the target, and the bridge would repeat them. The target's share rises later where
-rewards are sparse: HALF becomes HALF d + SPARSE_HALF (1 - d), with d of levels of the target.
+c moves the bridge's part q to MOST and ``low`` to LEAST. Where levels do not come back one by one,
+it also moves the bridge's candidates to MANY times as many, and ``delta`` to MASTERED; where they
+do, there are few near to the target, and such a bridge would stay on the easy ones. The target's
+share rises later where rewards are sparse: HALF becomes HALF d + SPARSE_HALF (1 - d), with the
+larger d of levels of the target and of uniform ones. All of this needs success that is told.
 
-A data set has items that come back, and nothing between two of them. There is nothing to be made,
-so that there are more candidates, all different, and learnability counts for more; and their
-success is drawn from the posterior, so that items of which little or nothing new is known are
-tried again.
+A data set has items that come back, and nothing between two of them. Nothing is concentrated
+there. As no levels can be made, there are more candidates, all different, and learnability counts
+for more; and their success is drawn from the posterior, so that items of which little or nothing
+new is known are tried again.
 """
 
 from __future__ import annotations
@@ -98,7 +99,6 @@ AT_ONCE, LARGE = 64, 512
 MOST_LEVELS = 3072  # candidates of a batch, where more are wanted where it is concentrated
 FORBIDDEN = 1e3  # cost of a candidate that is not mastered
 FAILURES = 4.0  # on the target, that are taken for seen at the beginning
-SHOWN = 6  # levels of each arm that a reader is shown
 OUTLIERS, MOST_OUTLIERS = 1000, 63  # one in so many returns at either end; and at most
 EQUAL = 1e-9  # returns that differ no more than this are equal, in units of the largest
 
@@ -123,9 +123,6 @@ class AdaptiveMixture(Curriculum):
         delta: least expected success of a level of the bridge.
         half_life: batches after which the belief counts an outcome half.
         times: candidates for each level of the bridge.
-        concentrate: whether the bridge gets nearly all of a batch while uniform levels are seldom
-            solved and failures all return the same, and the target's share rises later there. It
-            changes nothing for a data set, and where no success is told.
     """
 
     optional_results = ("success",)
@@ -140,7 +137,6 @@ class AdaptiveMixture(Curriculum):
         "_shown",
         "_belief",
         "_last",
-        "_some",
     )
 
     @checked
@@ -153,14 +149,12 @@ class AdaptiveMixture(Curriculum):
         delta: Share = 0.3,
         half_life: Annotated[float, Ge(1)] = 12.0,
         times: Count = 4,
-        concentrate: bool = False,
     ) -> None:
         self._space, self._target = space, target
         # A data set has items, and nothing between two of them.
         self._is_data = hasattr(space, "items") and not hasattr(space, "between")
         self._known = inputs or partial(level_inputs, space)
         self._delta, self._half_life, self._times = delta, half_life, times
-        self._concentrate = concentrate and not self._is_data
         one = space.sample(1, torch.Generator())
         items = 0 if self._items(one) is None else space.size
         self._come_back = items > 0
@@ -176,10 +170,6 @@ class AdaptiveMixture(Curriculum):
         self._last: Levels = one[:0]  # of the bridge, [m]
         self._came: list[dict[str, Any]] = []  # what the next proposal learns from
         self._seen = Predictions()
-        # Of the last proposal some levels, and their arms.
-        self._some = TensorDict(
-            {"level": self._last, "arm": torch.zeros(0, dtype=torch.int64)}, [0]
-        )
         self._shown: dict[str, Any] = {}
 
     @classmethod
@@ -194,8 +184,6 @@ class AdaptiveMixture(Curriculum):
             self._learn(seen, batches)
         levels, arms = self._batch(count, self._shares(), rng.generator("levels"))
         inputs, items = self._inputs(levels), self._items(levels)
-        few = torch.cat([(arms == i).nonzero().flatten()[:SHOWN] for i in range(len(ARMS))])
-        self._some = TensorDict({"level": levels[few], "arm": arms[few]}, [len(few)])
         notes = {"arm": arms, "inputs": inputs, "predicted": self._belief.predict(inputs, items)}
         if items is not None:
             notes["items"] = items
@@ -217,10 +205,6 @@ class AdaptiveMixture(Curriculum):
         :func:`~proposer_rl.curricula.outcome_model.calibration`.
         """
         shown, self._shown = self._shown, {}
-        if len(self._some):
-            levels, arms = self._some["level"], self._some["arm"]
-            shown["levels"] = {ARMS[i]: levels[arms == i] for i in arms.unique().tolist()}
-            self._some = self._some[:0]
         return shown | self._seen.log()
 
     def _learn(self, seen: Mapping[str, Any], batches: float) -> None:
@@ -302,13 +286,13 @@ class AdaptiveMixture(Curriculum):
         low = FLOOR + (LOW - FLOOR) * (2 * signal).clamp(max=1)
         half = torch.tensor(HALF if self._told else HALF_OF_RETURNS, dtype=torch.float64)
         bridge = (BRIDGE_AT_ONCE + skill / 2).clamp(BRIDGE_LEAST, BRIDGE_MOST)
-        if self._concentrate and self._told:
-            half = SPARSE_HALF + (half - SPARSE_HALF) * dense(TARGET)
-            if not self._come_back:
-                seldom = ((OFTEN - solved / number) / (OFTEN - SELDOM)).clamp(0, 1)
-                c = (seldom * (1 - dense(UNIFORM))).nan_to_num(0.0)
-                low, bridge = low + c * (LEAST - low), bridge + c * (MOST - bridge)
-                self._concentration = float(c)
+        if self._told and not self._is_data:
+            everywhere = dense(UNIFORM)
+            half = SPARSE_HALF + (half - SPARSE_HALF) * torch.maximum(dense(TARGET), everywhere)
+            seldom = ((OFTEN - solved / number) / (OFTEN - SELDOM)).clamp(0, 1)
+            c = (seldom * (1 - everywhere)).nan_to_num(0.0)
+            low, bridge = low + c * (LEAST - low), bridge + c * (MOST - bridge)
+            self._concentration = float(c)
         target = low + (HIGH - low) * self._best / (self._best + half)
         if self._target is None:
             target = torch.zeros_like(target)
@@ -339,7 +323,8 @@ class AdaptiveMixture(Curriculum):
         goal = self._space if self._target is None else self._target
         targets = goal.sample(count, draw)
         times = self._times * (ITEMS_TIMES if self._is_data else 1)
-        times = max(times, min(round(times * MANY**self._concentration), MOST_LEVELS // count))
+        c = 0.0 if self._come_back else self._concentration
+        times = max(times, min(round(times * MANY**c), MOST_LEVELS // count))
         levels = self._candidates(times * count, targets, draw)
         goals, x, items = self._inputs(targets), self._inputs(levels), self._items(levels)
         # Items are explored by draws, which differ where little is known, or nothing new.
@@ -347,7 +332,7 @@ class AdaptiveMixture(Curriculum):
             p = self._belief.predict(x, items)
         else:
             p = self._belief.draw(x, items, draw)
-        delta = self._delta + self._concentration * max(MASTERED - self._delta, 0)
+        delta = self._delta + c * max(MASTERED - self._delta, 0)
         allowed = p >= p.topk(count).values[-1].clamp(max=delta)
         bonus = ITEMS_LEARNABLE if self._is_data else LEARNABLE
         extra = torch.where(allowed, -bonus * 4 * p * (1 - p), FORBIDDEN)
@@ -361,7 +346,11 @@ class AdaptiveMixture(Curriculum):
             some = goals[start : start + number * size].view(number, size, x.shape[1])
             far = torch.cdist(some, every).square_().div_(max(x.shape[1], 1))
             for costs in far.add_(extra[few].view(number, 1, -1)):
-                chosen.append(times * start + assigned(costs))
+                block = slice(times * start, times * (start + size))
+                able = allowed[block].nonzero().flatten()
+                # The others would be left over, and an assignment among few takes less time.
+                able = able if len(able) >= size else torch.arange(times * size)
+                chosen.append(block.start + able[assigned(costs[:, able])])
                 start += size
         self._last = levels[torch.cat(chosen)]
         return self._last

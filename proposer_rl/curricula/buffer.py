@@ -15,7 +15,7 @@ level was last drawn or scored. A buffer is a tensordict [N] on the CPU with the
 - ``touched`` int64: the clock when the level was last drawn or scored. The clock counts draws and
   scores; it is the entry ``clock``, the same in all slots;
 - ``key`` int64: equal for equal levels only; ``parent``: the key of the level that was edited, 0
-  for none; ``generation`` int64: number of edits since a generated level; ``draws`` int64.
+  for none; ``generation`` int64: number of edits since a generated level.
 
 Slots are changed level by level, with NumPy, because a level is only a few numbers: ``numbers`` are
 entries of the buffer by name, arrays [N] that are changed in place. A new score moves only the
@@ -75,7 +75,7 @@ class ReplayRule:
 def empty_buffer(level: Any, capacity: int) -> TensorDict:
     """Makes an empty buffer [capacity] for levels like the given one, []."""
     shape = (capacity,)
-    numbers = ("touched", "clock", "key", "parent", "generation", "draws")
+    numbers = ("touched", "clock", "key", "parent", "generation")
     return TensorDict(
         {
             "level": torch.zeros_like(level).cpu().expand(shape).clone(),
@@ -174,9 +174,7 @@ def draw_slots(
     entries = dict(buffer.items())
     by_score = score_weights(entries["score"], entries["filled"], rule).numpy()
     noise = torch.rand(count, generator=generator, dtype=torch.float64).numpy()
-    slots = torch.from_numpy(draw_row(_numbers(entries), by_score, rule.staleness, noise))
-    entries["draws"].scatter_add_(0, slots, torch.ones_like(slots))
-    return slots
+    return torch.from_numpy(draw_row(_numbers(entries), by_score, rule.staleness, noise))
 
 
 def insert(buffer: TensorDictBase, new: TensorDictBase, rule: ReplayRule) -> None:
@@ -213,7 +211,6 @@ def insert(buffer: TensorDictBase, new: TensorDictBase, rule: ReplayRule) -> Non
         "best": best,
         "parent": fresh.get("parent", none),
         "generation": fresh.get("generation", none),
-        "draws": none,
         "reached": fresh.get("reached", torch.full(keys.shape, -torch.inf)),
     }
     for name, entry in kept.items():
@@ -243,25 +240,6 @@ def rescore(
         there.copy_(_mean_of_slots(there, slots, entry))
     there = buffer["best"]
     there.scatter_reduce_(0, slots, best.to(there), "amax")
-
-
-def lineage(buffer: TensorDictBase, most: int) -> Tensor:
-    """Returns the slots of the longest chain of edits, from ancestor to descendant: int64 [m].
-
-    Args:
-        buffer: [N].
-        most: largest number of slots to return, counted from the end of the chain.
-    """
-    place = {key: slot for slot, key in enumerate(buffer["key"].tolist())}
-    parents = [place.get(key) for key in buffer["parent"].tolist()]
-    longest: list[int] = []
-    for slot in range(len(parents)):
-        line, parent = [slot], parents[slot]
-        while parent is not None and parent not in line and len(line) < most:
-            line.append(parent)
-            parent = parents[parent]
-        longest = max(longest, line, key=len)
-    return torch.tensor(longest[::-1])
 
 
 def _mean_of_slots(old: Tensor, slots: Tensor, new: Tensor) -> Tensor:

@@ -236,12 +236,9 @@ class Mixed(Combinator):
     def log(self) -> dict[str, Any]:
         """Returns the logs of the parts, with the number of the part before each entry."""
         record: dict[str, Any] = {}
-        levels: dict[str, Any] = {}
         for i, part in enumerate(self.parts):
-            log = part.log()
-            levels |= {f"{i}: {caption}": some for caption, some in log.pop("levels", {}).items()}
-            record |= {f"{i}_{key}": value for key, value in log.items()}
-        return {**record, "levels": levels} if levels else record
+            record |= {f"{i}_{key}": value for key, value in part.log().items()}
+        return record
 
 
 def _mixes(curriculum: Curriculum) -> bool:

@@ -172,7 +172,7 @@ class Curriculum:
     def log(self) -> dict[str, Any]:
         """Returns what happened since the last call, ready for JSON; empty if nothing did.
 
-        The entry ``levels`` may hold levels [m] by caption. Called after every cycle.
+        Called after every cycle.
         """
         return {}
 

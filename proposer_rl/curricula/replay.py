@@ -1,4 +1,4 @@
-"""Curricula that replay levels from a buffer: PLR, robust PLR, ACCEL, NCC and TRACED.
+"""Curricula that replay levels from a buffer: PLR, robust PLR, ACCEL and NCC.
 
 The methods are options of one loop:
 
@@ -39,7 +39,6 @@ from proposer_rl.curricula.buffer import (
     draw_slots,
     empty_buffer,
     insert,
-    lineage,
     replay_weights,
     rescore,
 )
@@ -57,7 +56,6 @@ Edit = Callable[[Levels, int, Sequence[torch.Generator]], Levels]
 Parents = Literal["batch", "easy"]
 
 EASY = 4  # parents of a batch of children, unless all of the batch are
-SHOWN = 6  # levels of each kind in a report
 
 
 class ReplayCurriculum(Curriculum):
@@ -81,15 +79,13 @@ class ReplayCurriculum(Curriculum):
             them with the lowest difference of mean return and mean absolute advantage (``easy``).
         renew: whether to renew all scores before each draw, instead of the scores of the levels
             that were trained on.
-        co_learnability: how much the scores of the previous batch rise for each unit by which the
-            scores of this batch have fallen (TRACED, arXiv 2506.19997); no effect if ``renew``.
 
     Raises:
         DivergedError: in :meth:`propose`, if a level is to be replayed and none has a score.
         ArgumentError: if edits are asked for and the task has none, or options contradict.
     """
 
-    state = ("_scored", "_came_back", "_before", "buffer", "_last")
+    state = ("_scored", "_came_back", "buffer", "_last")
 
     @checked
     def __init__(
@@ -108,7 +104,6 @@ class ReplayCurriculum(Curriculum):
         edits: Annotated[int, Interval(ge=0, le=1_000_000)] = 0,
         parents: Parents = "batch",
         renew: bool = False,
-        co_learnability: float = 0.0,
     ) -> None:
         synchronous = not train_on_new if synchronous is None else synchronous
         if train_on_new and synchronous:
@@ -134,15 +129,13 @@ class ReplayCurriculum(Curriculum):
         self._capacity, self._warm = capacity, fill * capacity
         self._probability = replay_probability
         self._synchronous, self._train_on_new = synchronous, train_on_new
-        self._renew, self._co_learnability = renew, co_learnability
+        self._renew = renew
         self._template = self._new_levels.sample(1, torch.Generator())[0]
         self._device = device_of(self._template)
         self.buffer = empty_buffer(self._template, self._capacity)
         # Batches [m] whose children, or exact scores, are due at the next proposal.
         self._due: list[TensorDict] = []
         self._last: Levels = self.buffer["level"][:0]  # what was observed last, [m]
-        # "slot" and "key" [m] of the previous batch.
-        self._before: dict[str, Tensor] = {}
         self._scored = 0  # new levels
         self._came_back = {"levels": 0, "replayed": 0}
 
@@ -222,7 +215,6 @@ class ReplayCurriculum(Curriculum):
             "effective_levels": float(1 / shares.square().sum()),
             "mean_score": float(buffer["score"].where(filled, 0).sum() / count),
             "mean_generation": float(buffer["generation"].where(filled, 0).sum() / count),
-            "levels": self._shown(),
         }
         if len(self._last):
             record["distinct_levels"] = len(level_keys(self._last).unique())
@@ -329,35 +321,13 @@ class ReplayCurriculum(Curriculum):
             return
         slots = evidence["slot"]
         # By the time a result comes back, another level may have taken the slot.
-        there, before = self.buffer["key"][slots] == evidence["key"], self.buffer["score"][slots]
+        there = self.buffer["key"][slots] == evidence["key"]
         new = (entry.where(there, -torch.inf) for entry in (*scored, reached))
         rescore(self.buffer, slots, *new)
-        if self._co_learnability:
-            self._credit(before, slots)
-
-    def _credit(self, score: Tensor, slots: Tensor) -> None:
-        """Raises the scores of the previous batch by how much the scores [m] of this one fell."""
-        fell = (score - self.buffer["score"][slots]).mean()
-        if before := self._before:
-            there = self.buffer["key"][before["slot"]] == before["key"]  # not evicted since
-            credited = torch.zeros_like(self.buffer["filled"]).scatter(0, before["slot"], there)
-            self.buffer["score"] += self._co_learnability * fell * credited
-        self._before = {"slot": slots, "key": self.buffer["key"][slots]}
 
     def _fresh(self, count: int, rng: Streams, *purpose: str | int) -> Levels:
         """Draws new levels [count] on the CPU."""
         return moved(self._new_levels.sample(count, rng.generator(*purpose)), CPU)
-
-    def _shown(self) -> dict[str, Levels]:
-        """Returns levels of the buffer to show in reports, by caption."""
-        buffer = self.buffer[self.buffer["filled"]]
-        shown = {
-            "highest scores": buffer["score"].topk(min(SHOWN, len(buffer))).indices,
-            "most replayed": buffer["draws"].topk(min(SHOWN, len(buffer))).indices,
-        }
-        if self._edits:
-            shown["the longest line of edits in the buffer"] = lineage(buffer, SHOWN)
-        return {caption: buffer["level"][which] for caption, which in shown.items()}
 
 
 def parents_among(evidence: TensorDictBase) -> Tensor:

@@ -16,8 +16,6 @@ from proposer_rl.settings import Count, Share, checked
 from proposer_rl.streams import Streams
 from proposer_rl.task import Distribution, Levels
 
-SHOWN = 6  # levels in a report
-
 
 class SamplingCurriculum(Curriculum):
     """Draws every batch from one fixed distribution: the target, or domain randomization.
@@ -118,12 +116,11 @@ class SelectionCurriculum(Curriculum):
         self.kept = levels[best.indices[: self._keep].to(device_of(levels))]
 
     def log(self) -> dict[str, Any]:
-        """Returns the scores of the kept levels, and the best levels."""
+        """Returns the scores of the kept levels."""
         if not len(self.kept):
             return {}
         return {
             "highest_score": float(self.scores[0]),
             "lowest_kept_score": float(self.scores[-1]),
             "mean_score": float(self.scores.mean()),
-            "levels": {"highest scores": self.kept[:SHOWN]},
         }

@@ -72,17 +72,13 @@ class RunTables:
         logs: Sequence[Mapping[str, Any]],
         costs: Sequence[Mapping[str, float]],
     ) -> None:
-        """Writes each curriculum's log of the last cycle, with the levels in it recorded."""
+        """Writes each curriculum's log of the last cycle."""
         for seed, log, spent in zip(self._seeds, logs, costs, strict=True):
-            told = dict(log)
-            if "levels" in told:
-                shown = told["levels"].items()
-                told["levels"] = {text: self._task.record(some, None) for text, some in shown}
             place: dict[str, Any] = {"cycle": cycle, "updates": updates}
             if len(self._seeds) > 1:
                 place["seed"] = seed
             asked = {name: spent[name] for name in ("curriculum_frames", "evaluations")}
-            self._append("cycles.jsonl", {**place, **asked, **told})
+            self._append("cycles.jsonl", {**place, **asked, **log})
 
     def log_again(self, updates: int) -> None:
         """Logs again the rows of the update from which a resumed run goes on.

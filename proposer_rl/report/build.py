@@ -8,8 +8,6 @@ import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from tqdm import tqdm
-
 from proposer_rl.report import arena, figures, outcomes, page, runs, teachers
 from proposer_rl.report.charts import charts
 from proposer_rl.report.outcomes import Meanings, answer
@@ -25,29 +23,10 @@ PAGE = "report.html"
 LOG = ".jsonl"  # the suffix of teachers' logs
 FIGURES, TABLES = "figures", "tables"
 
-# In the order of the page.
 DRAWINGS: Sequence[Callable[[Study], Drawing | None]] = (
     figures.learning_curves,
-    figures.cost_curves,
-    figures.difficulty,
     figures.heat_maps,
-    figures.along_training,
-    figures.side_by_side,
-    figures.recorded_by_curricula,
 )
-
-# The page has no charts of these, so it embeds them as pictures.
-STILL = {figures.side_by_side, figures.recorded_by_curricula}
-
-# A caveat on means over the worst share of the levels, by whether measurements are exact.
-SELECTION = {
-    True: "Measurements are exact, so sorting the levels by them adds no bias, and no second "
-    "evaluation is needed.",
-    False: "Measurements are sampled and the levels are sorted by them, so selection bias makes "
-    "these means too low, the more the smaller the share.",
-    None: "The runs do not say whether their measurements are exact. If they are sampled, "
-    "selection bias makes these means too low, the more the smaller the share.",
-}
 
 
 def read_checked(
@@ -80,7 +59,6 @@ def write_report(
     baselines: Sequence[str] = (),
     compare: Sequence[str] = (),
     *,
-    progress: bool = True,
     meanings: Meanings | None = None,
 ) -> Path:
     """Writes a report and returns the path of its page.
@@ -95,7 +73,6 @@ def write_report(
             ``target``.
         compare: labels of the methods whose comparison was planned, for which alone p-values are
             corrected; by default all methods.
-        progress: whether to draw a progress bar.
         meanings: what methods and ablations do, by ``method`` or ``ablation`` and name, for runs
             that do not tell.
     """
@@ -112,15 +89,12 @@ def write_report(
     if compared is not None:
         over_tasks = _over_tasks(compared, files)
         parts.append(page.over_tasks(compared, f"{FIGURES}/"))
-    with tqdm(
-        total=len(DRAWINGS) * len(studies), desc="Report", disable=not progress, leave=False
-    ) as bar:
-        for study in studies:
-            prefix = f"{_slug(study.title)}_" if len(studies) > 1 else ""
-            if f"{TABLES}/{prefix}runs.csv" in files:  # same title, other measurements
-                prefix += f"{len(sections) + 1}_"
-            sections.append(_section(study, prefix, files, bar, meanings or {}))
-            parts.append(page.section(study, f"{FIGURES}/{prefix}"))
+    for study in studies:
+        prefix = f"{_slug(study.title)}_" if len(studies) > 1 else ""
+        if f"{TABLES}/{prefix}runs.csv" in files:  # same title, other measurements
+            prefix += f"{len(sections) + 1}_"
+        sections.append(_section(study, prefix, files, meanings or {}))
+        parts.append(page.section(study, f"{FIGURES}/{prefix}"))
     told: page.Section | None = None
     if curves.logs:
         drawings = teachers.drawings(curves.logs)
@@ -187,7 +161,7 @@ def _add(tables: Sequence[Table], prefix: str, files: dict[str, bytes]) -> None:
 
 
 def _section(
-    study: Study, prefix: str, files: dict[str, bytes], bar: tqdm, meanings: Meanings
+    study: Study, prefix: str, files: dict[str, bytes], meanings: Meanings
 ) -> page.Section:
     """Returns the page's section on a study, and adds its files to ``files``."""
     methods = outcomes.group_table(study)
@@ -197,13 +171,9 @@ def _section(
     named = [(group.label, run) for group in study.groups for run in group.runs]
     rows = runs.tables(named, "method")
     files |= {f"{TABLES}/{prefix}{name}.csv": runs.to_csv(own) for name, own in rows.items()}
-    still = []
     for draw in DRAWINGS:
-        drawing = draw(study)
-        if drawing is not None:
-            png = _drawn(drawing, prefix, files)
-            still += [page.figure(drawing, png)] if draw in STILL else []
-        bar.update()
+        if drawing := draw(study):
+            _drawn(drawing, prefix, files)
     data = charts(study)
     return {
         "study": study,
@@ -219,10 +189,7 @@ def _section(
         "meanings": page.methods(study, meanings),
         "data": page.pack(json.dumps(data, allow_nan=False, separators=(",", ":"))),
         "staged": data["stages"] is not None,
-        "single": bool(data["levels"]),
-        "selection": SELECTION[study.example.task.exact],
         "methods": methods,
-        "figures": still,
         "tables": tables,
         "commands": page.commands(study),
         "configs": page.configs(study),

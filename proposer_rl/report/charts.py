@@ -36,17 +36,14 @@ def charts(study: Study) -> dict[str, Json]:
     Returns:
         ``methods``: labels and seeds. ``axes``: the possible abscissas. ``measures``: by axis the
         median and interval of every method, with the ``rows`` and ``seeds`` of its runs, or null.
-        ``outcomes``: means, and the values of runs. ``levels``: each method's results on single
-        levels, or null, of every measurement that two methods recorded. ``baseline``: the method's
-        number. ``headline``: its name, and whether it is a rate. ``stages``: of the slider, or
-        null.
+        ``outcomes``: means, and the values of runs. ``baseline``: the method's number.
+        ``headline``: its name, and whether it is a rate. ``stages``: of the slider, or null.
     """
     return {
         "methods": [{"label": group.label, "seeds": group.seeds} for group in study.groups],
         "axes": [measures.UPDATES, *measures.COSTS],
         "measures": [_measure(study, each) for each in measures.every(study)],
         "outcomes": _outcomes(study),
-        "levels": _levels(study),
         "baseline": [group.label for group in study.groups].index(study.baseline.label),
         "headline": {"name": axis_text(study.headline), "rate": is_rate(study.headline)},
         "stages": _stages(study),
@@ -64,25 +61,7 @@ def _measure(study: Study, measure: Measure) -> Json:
         "name": measure.name,
         "axes": {axis: [_series(of(g)) for g in study.groups] for axis, of in measure.axes.items()},
         "rate": measure.rate,
-        "log": measure.log,
     }
-
-
-def _levels(study: Study) -> list[Json]:
-    """Returns the methods' final results on every single level, means over seeds."""
-    every = {
-        name: [study.scores(group, name) for group in study.groups]
-        for name in measures.of_levels(study)
-    }
-    return [
-        {
-            "name": axis_text(name),
-            "rate": is_rate(name),
-            "methods": [None if one is None else plain(one.mean(0)) for one in scores],
-        }
-        for name, scores in every.items()
-        if sum(one is not None for one in scores) > 1
-    ]
 
 
 def _series(series: Series | None) -> Json:

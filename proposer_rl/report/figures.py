@@ -36,9 +36,7 @@ MOST_PANELS = 12
 STAGES = 5
 BATCH = 2  # levels of a batch
 SIDE = 1.25  # inches of a level
-SAMPLES = 6
 STRIP = (7.6, 2.1)  # inches, of a row of heat maps
-SINGLE = (3.6, 3.0)
 MOST_TICKS = 10
 
 
@@ -46,7 +44,7 @@ def learning_curves(study: Study) -> Drawing:
     """Draws measurements along training and updates to the threshold (the paper's Figure 2)."""
     every = measures.measured(study)
     panels = [
-        partial(_draw_curves, study=study, measure=every[name])
+        partial(draw_curves, study=study, measure=every[name])
         for name in study.measurements[:MOST_PANELS]
     ]
     return Drawing(
@@ -59,46 +57,6 @@ def learning_curves(study: Study) -> Drawing:
         [*panels, partial(_draw_bars, study=study)],
         3,
         study.legend,
-    )
-
-
-def cost_curves(study: Study) -> Drawing:
-    """Draws the headline against updates and against costs, including those of the curriculum."""
-    measure = measures.measured(study)[study.headline]
-    seconds = (
-        "Seconds are of the whole process, including evaluation, or an even share where seeds were "
-        "trained together. Compare them only between runs on equal machines."
-    )
-    if study.timed:
-        seconds = (
-            "Seconds are updates times the seconds of one, with all methods timed in turns on one "
-            f"machine ({study.timed}) and without evaluations."
-        )
-    return Drawing(
-        "cost",
-        f"The same {words(study.headline)} against updates and against its whole cost",
-        "Frames are the Solver's own and those that the curriculum spent on replicas or scoring. "
-        + seconds,
-        [partial(_draw_curves, study=study, measure=measure, axis=axis) for axis in measure.axes],
-        3,
-        study.legend,
-    )
-
-
-def difficulty(study: Study) -> Drawing | None:
-    """Draws statistics of the levels trained on; None where no run has recorded any."""
-    every = measures.trained(study)
-    shown = [g for g in study.groups if any(each.axes[UPDATES](g) is not None for each in every)]
-    if not shown:
-        return None
-    return Drawing(
-        "difficulty",
-        "What the Solver trained on",
-        "Statistics of the batch at each evaluated update: means, or standard deviations where the "
-        "name says sd. Lines and bands are as above.",
-        [partial(_draw_curves, study=study, measure=measure) for measure in every],
-        3,
-        {group.label: group.look for group in shown},
     )
 
 
@@ -118,7 +76,8 @@ def draw_series(axes: Axes, series: Series, look: Look) -> np.ndarray:
     return median
 
 
-def _draw_curves(figure: FigureBase, study: Study, measure: Measure, axis: str = UPDATES) -> None:
+def draw_curves(figure: FigureBase, study: Study, measure: Measure, axis: str = UPDATES) -> None:
+    """Draws a measure of all methods along an axis."""
     axes = figure.subplots()
     found = [(group.look, measure.axes[axis](group)) for group in study.groups]
     means = [draw_series(axes, series, look) for look, series in found if series is not None]
@@ -153,73 +112,6 @@ def _draw_bars(figure: FigureBase, study: Study) -> None:
     axes.axvline(horizon, color="0.4", linewidth=0.8, linestyle=":")
     axes.grid(axis="y", visible=False)
     axes.set_xlabel(outcome.name)
-
-
-def along_training(study: Study) -> Drawing | None:
-    """Draws levels of the batch at several stages of training (the paper's Figure 3)."""
-    shown = [(group.label, group.runs[0].samples) for group in study.groups]
-    panels = [
-        partial(_draw_stages, samples=samples, title=label)
-        for label, samples in shown
-        if any(level.picture for sample in samples for level in sample.levels[:BATCH])
-    ]
-    if not panels:
-        return None
-    task = study.example.task
-    return Drawing(
-        "levels",
-        f"{task.levels.capitalize()} along training (the paper's Figure 3)",
-        f"The first {BATCH} {task.levels} of the batch of the method's first seed. {task.key}",
-        panels,
-        size=(SIDE * STAGES, SIDE * BATCH + 0.5),
-    )
-
-
-def side_by_side(study: Study) -> Drawing | None:
-    """Draws evaluation levels, and early and late proposals (the paper's Figure 5)."""
-    task = study.example.task
-    rows = [(words(name), task.samples.get(name, [])) for name in task.distributions]
-    for group in study.groups:
-        samples = group.runs[0].samples if group.proposes else ()
-        for stage, sample in zip(("first", "last"), (*samples[:1], *samples[-1:]), strict=False):
-            rows.append((f"{group.label}, {stage} (update {sample.updates})", sample.levels))
-    return _in_rows(
-        rows,
-        "samples",
-        "Evaluation levels and proposals (the paper's Figure 5)",
-        f"Random {task.levels} of the distributions, and those that the Proposers made at their "
-        f"first and last evaluated update. {task.key}",
-    )
-
-
-def recorded_by_curricula(study: Study) -> Drawing | None:
-    """Draws the levels that the curriculum of each method's first seed recorded last."""
-    task = study.example.task
-    rows = [
-        (f"{group.label}: {caption}", levels)
-        for group in study.groups
-        for caption, levels in group.runs[0].sheets.items()
-    ]
-    return _in_rows(
-        rows,
-        "recorded",
-        f"{task.levels.capitalize()} that the curricula recorded",
-        "The last record of each curriculum's first seed, such as the levels in its buffer. "
-        f"{task.key}",
-    )
-
-
-def _in_rows(
-    rows: Sequence[tuple[str, Sequence[LevelRecord]]], name: str, title: str, caption: str
-) -> Drawing | None:
-    """Draws a row of pictures for each title that has any; None without one."""
-    panels = [
-        partial(_draw_row, levels=levels, title=head)
-        for head, levels in rows
-        if any(level.picture for level in levels[:SAMPLES])
-    ]
-    size = (SIDE * SAMPLES, SIDE + 0.35)
-    return Drawing(name, title, caption, panels, 1, size=size) if panels else None
 
 
 def draw_run(folder: Path, title: str) -> Path:
@@ -261,11 +153,6 @@ def _draw_stages(figure: FigureBase, samples: Sequence[SampleRecord], title: str
         _show(column, sample.levels)
     _show(list(grid.T[len(stages) :].flat), ())
     figure.suptitle(title, fontsize=9)
-
-
-def _draw_row(figure: FigureBase, levels: Sequence[LevelRecord], title: str) -> None:
-    _show(figure.subplots(1, SAMPLES, squeeze=False)[0], levels)
-    figure.suptitle(title, fontsize=9, x=0.01, ha="left")
 
 
 def _show(places: Sequence[Axes], levels: Sequence[LevelRecord]) -> None:

@@ -15,7 +15,6 @@ from proposer_rl.report.comparisons import (
     TOO_FEW,
     Decision,
     against_baseline,
-    at_the_end,
     decisions,
     difference,
     difference_between,
@@ -24,12 +23,7 @@ from proposer_rl.report.comparisons import (
     waiting_outcome,
 )
 from proposer_rl.report.runs import Run
-from proposer_rl.report.statistics import (
-    FEWEST,
-    INTERVALS,
-    Interval,
-    probability_of_improvement,
-)
+from proposer_rl.report.statistics import FEWEST, INTERVALS, Interval
 from proposer_rl.report.studies import Group, Study
 from proposer_rl.report.tables import Cell, Table, write
 from proposer_rl.runs.records import level_text, words
@@ -50,7 +44,6 @@ def comparison_table(study: Study) -> Table:
             runs = [known[each.label] for each in (one, other)]
             if not all(runs):
                 continue
-            values = [outcome.sign * np.array([*each.values()]) for each in runs]
             decision = decided[one.label, other.label] if number == 0 else None
             rows.append(
                 {
@@ -61,7 +54,6 @@ def comparison_table(study: Study) -> Table:
                     "verdict": decision and decision.verdict,
                     "decision": decision and decision.told(one.label),
                     "p (Holm)": decision and decision.p,
-                    "P(first better)": probability_of_improvement(*values),
                     "seeds needed": decision and decision.seeds,
                 }
             )
@@ -73,7 +65,7 @@ def comparison_table(study: Study) -> Table:
         "needs for a power of 80 %, if the true difference is the one seen. With fewer than "
         f"{FEWEST} seeds there is no interval and no verdict."
     )
-    aside = ["verdict", "p (Holm)", "P(first better)"]
+    aside = ["verdict", "p (Holm)"]
     return Table("comparisons", "Pairwise comparisons", note, rows, aside)
 
 
@@ -224,26 +216,18 @@ def group_table(study: Study) -> Table:
     """Returns a table with a row for each group."""
     headline, horizon, threshold = study.headline, study.horizon, study.threshold
     first, waiting, *ends = outcomes(study)
-    shown, baseline = [waiting, first, *ends], study.baseline
-    worst, tenth = f"{headline}_worst10", f"{words(headline)}, worst 10 %"
+    shown = [waiting, first, *ends]
     rows: list[dict[str, Cell]] = []
     for group in study.groups:
         whole = study.group(group.label) or replace(group, runs=())
         runs, begun = whole.runs, len(group.runs)
         reached = sum(run.reached(headline, threshold) >= 0 for run in runs)
-        both = [first.values(group), first.values(baseline)]
-        other = group.label != baseline.label and all(both)
         row: dict[str, Cell] = {
             "method": group.label,
             "seeds": begun if len(runs) == begun else f"{len(runs)} of {begun}",
             f"reached {level_text(headline, threshold)}": f"{reached} of {len(runs)}",
             **{outcome.name: outcome.median(whole) for outcome in shown},
-            f"P(better than {baseline.label})": probability_of_improvement(*both)
-            if other
-            else None,
         }
-        if any(worst in run.metrics for run in study.runs):
-            row[tenth] = at_the_end(study, worst).median(whole)
         cost: dict[str, Callable[[Run], float]] = {
             "frames (M)": lambda run: run.last("frames") / MILLION,
             "with the curriculum's (M)": lambda run: run.total_frames[-1] / MILLION,
@@ -261,7 +245,7 @@ def group_table(study: Study) -> Table:
         "the curriculum spent. Evaluations are those of levels that the curriculum asked for. "
         f"{INTERVALS}"
     )
-    return Table("methods", "Methods", note, rows, [tenth, f"P(better than {baseline.label})"])
+    return Table("methods", "Methods", note, rows)
 
 
 def run_table(study: Study) -> Table:

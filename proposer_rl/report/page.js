@@ -72,7 +72,7 @@
   const drawCurves = (place, data, measure, along, colours, seeds) => {
     // As far as the coloured methods go: one that costs nine times as much would squeeze the others.
     const ends = [...colours.keys()].flatMap((m) => measure.axes[along][m]?.x.slice(-1) ?? []);
-    const shape = measure.log ? { type: "log", tickformat: ".0%", dtick: 0.5 } : ends.length ? { range: [0, Math.max(...ends)] } : {};
+    const shape = ends.length ? { range: [0, Math.max(...ends)] } : {};
     return draw(place, curveTraces(data, measure, along, colours, seeds), { height: 470, showlegend: true, legend: { orientation: "h", y: 1.02, yanchor: "bottom" },
       xaxis: axis(along, shape), yaxis: axis(measure.name, measure.rate ? { rangemode: "tozero" } : {}), uirevision: measure.name + along });
   };
@@ -94,22 +94,6 @@
     const labels = order.map((m) => plain(data.methods[m].label));
     return draw(place, traces, { height: 90 + 27 * order.length, xaxis: axis(outcome.name),
       yaxis: axis("", { tickvals: order.map((_, y) => y), ticktext: labels, range: [-0.6, order.length - 0.4], gridcolor: "#f2f4f6" }) });
-  };
-
-  // ---- Level by level: one method against another, a dot for each level.
-  const drawLevels = (place, shares, data, measure, up, across) => {
-    const [x, y] = [across, up].map((m) => measure.methods[m] ?? []), [right, top] = [across, up].map((m) => data.methods[m].label);
-    const share = (won) => x.filter((value, i) => won(y[i], value)).length / x.length;
-    const percent = (value) => `${Math.round(100 * value)} %`;
-    shares.textContent = x.length && y.length
-      ? `better on ${percent(share((a, b) => a > b))}, worse on ${percent(share((a, b) => a < b))}` : "no records of single levels";
-    const every = x.concat(y).filter((value) => value !== null), ends = measure.rate ? [0, 1] : [Math.min(...every), Math.max(...every)];
-    return draw(place, [
-      { type: "scatter", mode: "lines", x: ends, y: ends, line: { color: "#8c959f", width: 1 }, hoverinfo: "skip" },
-      { type: "scatter", mode: "markers", x, y, meta: "levels", text: x.map((_, i) => `number ${i}`),
-        marker: { color: COLOURS[0], size: 7, opacity: 0.4 },
-        hovertemplate: `<b>%{text}</b><br>${plain(top)}: %{y:.4~g}<br>${plain(right)}: %{x:.4~g}<extra></extra>` },
-    ], { height: 520, xaxis: axis(`${measure.name}, ${right}`), yaxis: axis(`${measure.name}, ${top}`) });
   };
 
   // ---- Through training: proposals, levels and success at one moment.
@@ -215,21 +199,7 @@
     });
     for (const each of [table, ...["seeds", "measure", "outcome"].map(one)]) each.addEventListener("change", redraw);
     redraw();
-    if (one("single")) single(one, data, option);
     if (one("through")) through(one, data, option);
-  };
-  const single = (one, data, option) => {
-    const telling = data.methods.map((_, m) => m).filter((m) => data.levels.some((measure) => measure.methods[m]));
-    const mean = (m) => (data.levels[0].methods[m] ?? []).reduce((sum, value) => sum + value, 0);
-    one("single-measure").append(...data.levels.map((measure, i) => option(measure.name, i)));
-    for (const name of ["up", "across"]) one(name).append(...telling.map((m) => option(data.methods[m].label, m)));
-    const [against] = [data.baseline, ...telling].filter((m) => telling.includes(m));
-    one("across").value = against;
-    [one("up").value] = telling.filter((m) => m !== against).sort((a, b) => mean(b) - mean(a));
-    const [measure, up, across] = ["single-measure", "up", "across"].map(one);
-    const show = () => drawLevels(one("single"), one("shares"), data, data.levels[Number(measure.value)], Number(up.value), Number(across.value));
-    for (const chosen of [measure, up, across]) chosen.addEventListener("change", show);
-    show();
   };
   const through = (one, data, option) => {
     const range = one("moment-slider"), choice = one("staged");

@@ -156,7 +156,6 @@ def _named(folders: Sequence[Path]) -> dict[str, list[Run]]:
 def _light(run: Run) -> Run:
     """Returns a run without pictures and this machine's folders, at six significant digits."""
     facts = {name: value for name, value in run.facts.items() if name != "final"}
-    facts["task"] = {name: value for name, value in facts["task"].items() if name != "samples"}
     reused = str(run.config.get("checkpoint") or "")
     config, facts = (_anywhere(value, reused) for value in (run.config, facts))
     return replace(
@@ -168,7 +167,6 @@ def _light(run: Run) -> Run:
         cycles=[_six_digits(cycle) for cycle in run.cycles],
         samples=(),
         levels={name: np.array(_six_digits([*column])) for name, column in run.levels.items()},
-        sheets={},
     )
 
 

@@ -18,7 +18,6 @@ from proposer_rl.runs.folder import FAILURE, is_rate, read_csv, read_jsonl
 from proposer_rl.runs.records import (
     LARGEST,
     Column,
-    LevelRecord,
     Record,
     SampleRecord,
     TaskFacts,
@@ -178,8 +177,6 @@ def _runs(
 ) -> list[Run]:
     """Returns a run for each seed; ``facts`` have ``updates`` only of finished runs."""
     task = checked(TaskFacts, facts["task"], "run.json: task")
-    pictured = dict[str, list[LevelRecord]]
-    sheets = [checked(pictured, row.pop("levels", {}), "cycles.jsonl: levels") for row in cycles]
     seeds = sorted(metrics["seed"].astype(int).unique().tolist())
     runs = []
     for seed in seeds:
@@ -195,7 +192,6 @@ def _runs(
             training=_of_seed(training, seed),
             cycles=[row for row in cycles if row.get("seed", seed) == seed],
             samples=[sample for sample in samples if sample.seed == seed],
-            sheets=_last_sheets(cycles, sheets, seed),
         )
         _check_metrics(run)
         finished = facts.get("updates") == run.updates
@@ -222,12 +218,6 @@ def _levels(rows: Sequence[Record], seed: int, updates: int) -> dict[str, Column
                     name = f"{row['distribution']}_{kind}"
                     found[name] = _rounded(is_rate(name), np.array(row[kind], float))
     return found
-
-
-def _last_sheets(cycles: Sequence[Record], sheets: Sequence[Any], seed: int) -> Any:
-    """Returns the pictures of a seed's last cycle that has any."""
-    own = [s for row, s in zip(cycles, sheets, strict=True) if s and row.get("seed", seed) == seed]
-    return own[-1] if own else {}
 
 
 def _rounded(rate: bool | NDArray[np.bool_], values: Column) -> Column:

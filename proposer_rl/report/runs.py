@@ -23,17 +23,19 @@ import pandas as pd
 from proposer_rl.runs.folder import SLACK
 from proposer_rl.runs.records import (
     Column,
-    LevelRecord,
     Record,
     SampleRecord,
     TaskFacts,
     encoded,
+    flat,
     number,
 )
 
 COST = ("updates", "frames", "curriculum_frames", "evaluations", "seconds")
 # Columns of training.csv that are PPO's, besides its losses; the others are the task's.
 OF_PPO = {"entropy", "kl_approx", "clip_fraction", "explained_variance", "grad_norm"}
+# Entries of a cycle's record that are not the curriculum's own.
+PLACE = {"cycle", "updates", "seed", "curriculum_frames", "evaluations", "histogram"}
 _STUDENT = re.compile(r"lifetime_(\d{1,9})")
 STUDY = "runs.csv.xz"  # a folder with this file is a study
 NAMES = ("metrics", "training", "cycles", "levels")
@@ -55,7 +57,6 @@ class Run:
         cycles: what the curriculum recorded, one per cycle; every entry but updates is optional.
         samples: recorded levels, one record per evaluation.
         levels: results on every level at the end, [levels], by the measurement's column.
-        sheets: pictures of levels by their captions, as the curriculum recorded them last.
     """
 
     folder: Path
@@ -70,7 +71,6 @@ class Run:
     cycles: Sequence[Record]
     samples: Sequence[SampleRecord]
     levels: Mapping[str, Column] = field(default_factory=dict)
-    sheets: Mapping[str, Sequence[LevelRecord]] = field(default_factory=dict)
 
     @property
     def method(self) -> str:
@@ -132,6 +132,12 @@ class Run:
         """Wall seconds at each evaluation; an even share where seeds were trained together."""
         return self.columns["seconds"] / self.shared_by
 
+    @cached_property
+    def told(self) -> Sequence[Mapping[str, float]]:
+        """The curriculum's own numbers in each cycle."""
+        own = ({k: v for k, v in cycle.items() if k not in PLACE} for cycle in self.cycles)
+        return [flat(cycle) for cycle in own]
+
     def last(self, name: str) -> float:
         """Returns the last value of a column of the measurements."""
         return float(self.columns[name][-1])
@@ -155,7 +161,6 @@ class Run:
             cycles=[cycle for cycle in self.cycles if number(cycle["updates"]) < horizon],
             samples=[sample for sample in self.samples if sample.updates <= horizon],
             levels={},
-            sheets={},
         )
 
     def reached(self, measurement: str, threshold: float) -> float:

@@ -156,26 +156,6 @@ def median_interval(values: Values) -> Interval:
     return Interval(*map(float, median_of(values)))
 
 
-def probability_of_improvement(one: Values, other: Values) -> Interval:
-    """Returns the probability that a run of ``one`` has a greater value than one of ``other``.
-
-    P(X > Y) + P(X = Y) / 2 over all pairs: the Mann-Whitney statistic over the number of pairs
-    (Agarwal et al., NeurIPS 2021). For any distributions its variance is at most that of a share
-    of min(n, m) trials, θ (1 - θ) / min(n, m) (van Dantzig, Indagationes Mathematicae 13, 1951).
-    The interval is that of such a share (Clopper & Pearson, Biometrika 26, 1934), and errs on the
-    wide side.
-    """
-    a, b = np.asarray(one, dtype=float)[:, None], np.asarray(other, dtype=float)[None]
-    share = float(((a > b) + (a == b) / 2).mean())
-    count = min(a.size, b.size)
-    if count < FEWEST:
-        return Interval(share, math.nan, math.nan)
-    wins, losses = share * count, count - share * count
-    low = scipy.special.betaincinv(wins, losses + 1, ERROR / 2) if wins else 0.0
-    high = scipy.special.betaincinv(wins + 1, losses, 1 - ERROR / 2) if losses else 1.0
-    return Interval(share, float(low), float(high))
-
-
 def holm(p_values: Sequence[float]) -> list[float]:
     """Returns p-values corrected for their number (Holm, Scandinavian J. of Statistics 6, 1979).
 

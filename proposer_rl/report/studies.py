@@ -11,12 +11,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from proposer_rl.report.reading import UnreadableRun, read_run
 from proposer_rl.report.runs import Run
 from proposer_rl.report.style import Look, looks
-from proposer_rl.runs.records import Column, natural
+from proposer_rl.runs.records import natural
 
 USUAL_BASELINE = "domain_randomization"
 LONGEST_LABEL = 40  # characters of the settings in a label
@@ -50,11 +48,6 @@ class Group:
     def seeds(self) -> list[int]:
         """The runs' seeds."""
         return [run.seed for run in self.runs]
-
-    @property
-    def proposes(self) -> bool:
-        """True if a Proposer was trained."""
-        return any("total_reward" in cycle for run in self.runs for cycle in run.cycles)
 
     @property
     def logs(self) -> list[Run]:
@@ -141,20 +134,6 @@ class Study:
         """The groups that are tested against each other: the planned ones and the baseline."""
         labels = {*self.planned, self.baseline.label}
         return [group for group in self.compared if not self.planned or group.label in labels]
-
-    def scores(self, group: Group, name: str) -> Column | None:
-        """Returns what runs of full length reach on each level, [runs, levels]; None without."""
-        rows = [run.levels[name] for run in self.tellers(group, name)]
-        return np.array(rows) if rows else None
-
-    def tellers(self, group: Group, name: str) -> list[Run]:
-        """Returns a group's runs of full length with as many levels as the study's first run."""
-        counts = [len(run.levels[name]) for run in self.runs if self._tells(run, name)]
-        own = [run for run in group.runs if self._tells(run, name)]
-        return [run for run in own if len(run.levels[name]) == counts[0]]
-
-    def _tells(self, run: Run, name: str) -> bool:
-        return name in run.levels and run.updates == self.horizon
 
     def group(self, label: str) -> Group | None:
         """Returns the compared group of that label; None if it is not there."""

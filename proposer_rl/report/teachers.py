@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
@@ -14,7 +13,7 @@ from matplotlib.figure import FigureBase
 from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.style import Drawing, Look, finish, looks, style
 from proposer_rl.runs.folder import read_jsonl
-from proposer_rl.runs.records import LARGEST, Column, Record, batch_shares, printable
+from proposer_rl.runs.records import Column, Record, flat, printable
 
 COMMON = ("mean_return", "mean_success", "proposed", "told", "dropped", "out")
 # Entries that are not curves: counts by bin, of the teacher and of its curriculum, and the teacher
@@ -48,18 +47,11 @@ class Log:
 
     @cached_property
     def entries(self) -> dict[str, Column]:
-        """Numbers by name, NaN where there is none; of several in an entry the mean, float [m]."""
-        rows = [
-            {**row, **{f"share: {name}": share for name, share in batch_shares(row).items()}}
-            for row in self.rows
-        ]
-        names = dict.fromkeys([*COMMON, *(name for row in rows for name in row)])
-        found = {
-            name: np.array([_mean(row.get(name)) for row in rows])
-            for name in names
-            if name not in ASIDE
-        }
-        return {name: values for name, values in found.items() if np.isfinite(values).any()}
+        """Numbers by name, NaN where there is none, float [m]; see :func:`flat`."""
+        own = [flat({k: v for k, v in row.items() if k not in ASIDE}) for row in self.rows]
+        known = dict.fromkeys(name for row in own for name in row)
+        names = [*(name for name in COMMON if name in known), *known]
+        return {name: np.array([row.get(name, np.nan) for row in own]) for name in names}
 
     @cached_property
     def drawn(self) -> dict[str, tuple[list[str], Column]]:
@@ -153,8 +145,9 @@ def drawings(logs: Mapping[str, Log]) -> list[Drawing]:
         Drawing(
             "teachers",
             "What came of the levels, and what the curricula tell",
-            "Each line of a log is a point and tells what happened since the line before. Entries "
-            f"of several numbers are averaged. Only the first {MOST_PANELS} entries are drawn.",
+            "Each line of a log is a point and tells what happened since the line before. Of "
+            "entries of several numbers the maximum and the mean are drawn. Only the first "
+            f"{MOST_PANELS} are drawn.",
             panels[:MOST_PANELS],
             3,
             named,
@@ -196,12 +189,3 @@ def _draw_map(figure: FigureBase, log: Log, name: str) -> None:
     axes.set_yticks(places, [printable(bins[place])[:24] for place in places], fontsize=7)
     axes.set(xlabel="line of the log", ylabel=printable(name)[:40])
     axes.grid(visible=False)
-
-
-def _mean(value: Any) -> float:
-    """Returns a number, or the mean of nested ones; NaN of anything else."""
-    if isinstance(value, list):
-        known = [one for one in map(_mean, value) if not math.isnan(one)]
-        return sum(known) / len(known) if known else math.nan
-    plain = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(value) if plain and abs(value) < LARGEST else math.nan

@@ -23,11 +23,6 @@ ACRONYMS = ("id", "ood")  # in- and out-of-distribution
 LARGEST = 1e100  # greater numbers are not measurements, and overflow when they are drawn
 LONGEST_TEXT = 400  # characters that are shown in a line
 
-# Total gains of replicas, by their names in the records of cycles; the first one found is shown.
-GAINS = {"log_success_gain": "log success", "return_gain": "return"}
-# Entries of a cycle's record that are not the curriculum's own.
-PLACE = {"cycle", "updates", "seed", "curriculum_frames", "evaluations", "histogram"}
-
 Column = NDArray[np.float64]
 Record = Mapping[str, Any]
 T = TypeVar("T")
@@ -62,7 +57,6 @@ class TaskFacts(BaseModel):
             name.
         about: further facts, by label.
         measured: everything that must be equal for two runs to be comparable.
-        samples: levels of each distribution.
         key: explains pictures of levels.
         text_key: explains levels that are drawn in characters.
         exact: whether measurements draw nothing at random; None if that is not known.
@@ -74,7 +68,6 @@ class TaskFacts(BaseModel):
     space: dict[str, list[FiniteFloat | str]] = {}
     about: dict[str, str] = {}
     measured: Any
-    samples: dict[str, list[LevelRecord]] = {}
     key: str = ""
     text_key: str = ""
     exact: bool | None = None
@@ -148,14 +141,21 @@ def numbers(value: Any) -> Column | None:
     return found if np.isfinite(found).all() else None
 
 
-def batch_shares(record: Record) -> dict[str, float]:
-    """Returns a record's ``shares`` of a batch by the names of its parts; empty if it has none.
+def flat(record: Record) -> dict[str, float]:
+    """Returns the finite numbers of a record by name, of a list of numbers its maximum and mean.
 
-    The shares of several students are averaged.
+    The entry ``shares``, shares of a batch by the names of its parts, has a number for each part;
+    those of several students are averaged.
     """
-    told = record.get("shares")
-    means = {name: number(own) for name, own in told.items()} if isinstance(told, Mapping) else {}
-    return {name: mean for name, mean in means.items() if not math.isnan(mean)}
+    found: dict[str, float] = {}
+    for name, value in record.items():
+        if name == "shares" and isinstance(value, Mapping):
+            found |= {f"{name}/{part}": number(own) for part, own in value.items()}
+        elif (several := numbers(value)) is not None:
+            found |= {f"{name}_max": float(several.max()), f"{name}_mean": float(several.mean())}
+        else:
+            found[name] = number(value)
+    return {name: value for name, value in found.items() if not math.isnan(value)}
 
 
 def words(name: str) -> str:

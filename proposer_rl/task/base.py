@@ -44,8 +44,6 @@ from proposer_rl.task.protocols import (
     space_features,
 )
 
-SAMPLES_SHOWN = 6  # levels of each distribution for readers
-
 
 class Task(ABC):
     """Trains Solvers in an environment and measures them; subclass it for your own task.
@@ -384,8 +382,7 @@ class Task(ABC):
         - ``about``: texts by their labels; ``key`` and ``text_key``: descriptions of a record's
           picture and of its text;
         - ``measured``: all that must be equal for two runs' metrics to be comparable;
-        - ``exact``: whether the metrics draw nothing at random;
-        - ``samples``: records (see :meth:`record`) of levels of each distribution measured on.
+        - ``exact``: whether the metrics draw nothing at random.
         """
         return {
             "title": self.title,
@@ -400,10 +397,6 @@ class Task(ABC):
             **({"text_key": self.text_key} if self.text_key else {}),
             "measured": self._measured,
             "exact": self.exact_metrics,
-            "samples": {
-                name: self.record(levels[:SAMPLES_SHOWN], None)
-                for name, levels in self.evaluated_on.items()
-            },
         }
 
     def level_results(

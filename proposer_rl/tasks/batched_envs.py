@@ -251,8 +251,6 @@ class BatchedTask(Task):
         levels: fixed evaluation levels of each distribution.
         solver: the Solver's training.
         context: device, precision and cores.
-
-    Attributes:
         seeded: whether levels have seeds, from which random numbers come.
 
     Raises:
@@ -262,7 +260,6 @@ class BatchedTask(Task):
     noun = "levels"
     batched: bool | None = True
     replayed = ("rollouts",)
-    seeded: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -274,13 +271,14 @@ class BatchedTask(Task):
         levels: Annotated[int, Ge(1)],
         solver: SolverSettings,
         context: ComputeContext,
+        seeded: bool = True,
     ) -> None:
         self._class, self._network = _environment_class(env), network
         self.memory = network.memory
-        self.title = getattr(self, "title", self._class.__name__.removesuffix("Env"))
+        self.title = self._class.__name__.removesuffix("Env")
         if network.memory is not None:
             self.batched = None
-        space, target = spaces(parameters, seeded=self.seeded, device=context.device)
+        space, target = spaces(parameters, seeded=seeded, device=context.device)
         self.edit, self.target_shares = space.edit, space.shares(target)
         super().__init__(
             distributions={"target": target, "all": space},

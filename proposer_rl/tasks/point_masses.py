@@ -1,24 +1,11 @@
-"""The point mass before a wall with a gate, as a TorchRL environment and as a task."""
+"""The point mass before a wall with a gate, as a TorchRL environment."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Annotated, Any
-
-import numpy as np
 import torch
-from annotated_types import Ge
-from numpy.typing import NDArray
-from PIL import Image, ImageDraw
-from tensordict import TensorDictBase
 from torch import Tensor
 
-from proposer_rl.learning import SolverSettings, in_first_episode
-from proposer_rl.settings import settings
-from proposer_rl.task import ComputeContext
-from proposer_rl.tasks.batched_envs import BatchedEnv, BatchedTask, Step, Values
-from proposer_rl.tasks.gymnasium.networks import NetworkSettings
-from proposer_rl.tasks.ranges import RangeSettings
+from proposer_rl.tasks.batched_envs import BatchedEnv, Step, Values
 
 GATE = ("position", "width", "friction")
 START_PLACE, GOAL_PLACE = (0.0, 3.0), (0.0, -3.0)
@@ -105,93 +92,3 @@ def after_substeps(state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tenso
     first = hits.to(torch.uint8).argmax(0, keepdim=True)
     at_wall = torch.stack([there.gather(0, first)[0], torch.zeros_like(gate)])
     return at_wall.where(hit, place), speed.masked_fill(hit, 0), hit
-
-
-SIDE_PIXELS = 120  # of a picture
-
-
-@settings
-class GateSettings:
-    """Settings of the parameters that differ between levels.
-
-    Attributes:
-        position: of the gate's middle along the wall.
-        width: of the gate.
-        friction: acceleration against the speed, per speed.
-    """
-
-    position: RangeSettings
-    width: RangeSettings
-    friction: RangeSettings
-
-
-class PointMassTask(BatchedTask):
-    """A point mass that must get through a gate in a wall, and stay at a goal behind it.
-
-    Args:
-        max_steps, network, levels, solver, context: as in
-            :class:`~proposer_rl.tasks.batched_envs.BatchedTask`.
-        parameters: what differs between levels.
-
-    Raises:
-        ArgumentError: naming the key, if a parameter is not valid.
-    """
-
-    title, noun, seeded = "point mass", "gates", False
-    key = "The wall with its gate, the goal (orange), and the path of the mass."
-
-    def __init__(
-        self,
-        *,
-        max_steps: Annotated[int, Ge(1)],
-        parameters: GateSettings,
-        network: NetworkSettings,
-        levels: Annotated[int, Ge(1)],
-        solver: SolverSettings,
-        context: ComputeContext,
-    ) -> None:
-        super().__init__(
-            env=f"{__name__}.{PointMassEnv.__name__}",
-            max_steps=max_steps,
-            parameters=vars(parameters),
-            network=network,
-            levels=levels,
-            solver=solver,
-            context=context,
-        )
-
-    def pictures(
-        self, levels: TensorDictBase, rollout: TensorDictBase | None
-    ) -> list[NDArray[np.uint8]]:
-        """Draws the walls of levels [n], and the mass's path in the first episode of [n, T]."""
-        paths: list[Any] = [[]] * len(levels)
-        if rollout is not None:
-            first = in_first_episode(rollout)
-            before, end = (part["observation"][..., [0, 2]] for part in (rollout, rollout["next"]))
-            each = zip(before, end, first, strict=True)
-            paths = [torch.cat([b[:1], e[f]]).tolist() for b, e, f in each]
-        return list(map(gate_picture, levels["position"].tolist(), levels["width"].tolist(), paths))
-
-
-def gate_picture(
-    position: float, width: float, path: Sequence[Sequence[float]]
-) -> NDArray[np.uint8]:
-    """Draws a wall with its gate, the goal, and a path: uint8 [SIDE_PIXELS, SIDE_PIXELS, 3]."""
-
-    def at(x: float, y: float) -> tuple[float, float]:
-        return (x + BORDER) / (2 * BORDER) * SIDE_PIXELS, (BORDER - y) / (2 * BORDER) * SIDE_PIXELS
-
-    def dot(place: Sequence[float], colour: tuple[int, int, int]) -> None:
-        across, down = at(place[0], place[1])
-        image.ellipse([across - 4, down - 4, across + 4, down + 4], colour)
-
-    picture = Image.new("RGB", (SIDE_PIXELS, SIDE_PIXELS), (250, 250, 250))
-    image = ImageDraw.Draw(picture)
-    for ends in ((-BORDER, position - width / 2), (position + width / 2, BORDER)):
-        if ends[0] < ends[1]:
-            image.line([at(ends[0], 0.0), at(ends[1], 0.0)], (45, 45, 45), 4)
-    dot(GOAL_PLACE, (230, 159, 0))
-    if path:
-        image.line([at(x, y) for x, y in path], (204, 121, 167), 2)
-        dot(path[-1], (0, 114, 178))
-    return np.asarray(picture)

@@ -200,11 +200,7 @@ class Policy(TensorDictModuleBase):
 
 
 def policy_of(task: Task, learner: PPO) -> Policy:
-    """Returns the only Solver of a task's learner as a policy.
-
-    Raises:
-        ValueError: if the task has transforms, which a plain environment lacks.
-    """
+    """Returns the only Solver of a task's learner as a policy."""
     if isinstance(task, GymnasiumTask):
         return Policy(learner.agent, *task.own_spaces(), plain=True)
     env, agent = learner.env, learner.agent

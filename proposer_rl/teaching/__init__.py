@@ -6,7 +6,6 @@ from proposer_rl.teaching.remote import TeacherClient as TeacherClient
 from proposer_rl.teaching.robots import LevelTerm as LevelTerm
 from proposer_rl.teaching.robots import TaughtRunner as TaughtRunner
 from proposer_rl.teaching.sampler import TeacherSampler as TeacherSampler
-from proposer_rl.teaching.sampler import mixed_groups as mixed_groups
 from proposer_rl.teaching.spaces import Items as Items
 from proposer_rl.teaching.spaces import LevelGenerator as LevelGenerator
 from proposer_rl.teaching.spaces import LevelSpace as LevelSpace

@@ -40,8 +40,6 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             of the last info (``"metrics.won"`` for an entry of an entry), or a function of the last
             info; None for the entry ``success`` or ``is_success``.
         once: whether an episode is a success if any of its steps was, not only the last.
-        reset_truncates: whether a reset truncates an episode that has begun, which then counts;
-            needed where wrappers outside end episodes.
 
     Raises:
         ArgumentError: if the environment has a ``TaughtEnv``; at a reset, if an attribute is
@@ -58,7 +56,6 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         *,
         success: str | Callable[[Mapping[str, Any]], Any] | None = None,
         once: bool = False,
-        reset_truncates: bool = False,
     ) -> None:
         inner = env
         while isinstance(inner, gymnasium.Wrapper):
@@ -72,7 +69,7 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         # The environment knows its wrapper by this list; a deep copy of both has its own.
         self._own = self.unwrapped._taught = [id(self)]  # type: ignore[attr-defined]
         self._teacher, self._how, self._rule = teacher, set, success
-        self._once, self._reset_truncates = once, reset_truncates
+        self._once = once
         self._ticket: int | None = None
         self._began = False  # any episode
         self._cut_off = 0  # number of episodes
@@ -143,16 +140,11 @@ class TaughtEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Drops the episode that is being played, if there is one."""
         if self._ticket is None:
             return
-        if self._steps and self._reset_truncates:
-            self._last = {**self._marked(self._last), "truncated": True}
-            self._end()
-            return
         self._cut_off += bool(self._steps)
         if self._steps and self._cut_off == 2:  # a single one may well be intended
             warnings.warn(
                 "TaughtEnv: a second episode was cut off by a reset; such episodes are dropped. "
-                "Put wrappers that end episodes inside, as in TaughtEnv(TimeLimit(env, 200), ...), "
-                "or give reset_truncates=True",
+                "Put wrappers that end episodes inside, as in TaughtEnv(TimeLimit(env, 200), ...)",
                 stacklevel=3,
             )
         self._teacher.drop(self._ticket)

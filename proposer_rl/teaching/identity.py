@@ -10,8 +10,6 @@ from proposer_rl.curricula.combinators import Combinator
 from proposer_rl.settings import ArgumentError
 from proposer_rl.task import Levels, level_inputs
 
-SHOWN = 3  # number of differences in an error
-
 
 def of_levels(space: Any, like: Levels) -> dict[str, Any]:
     """Describes a space or task, and its levels by an example: numbers and texts for JSON."""
@@ -34,19 +32,15 @@ def require_same(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -
     """Compares the description in a state with the present one.
 
     Raises:
-        ArgumentError: if they differ, naming what.
+        ArgumentError: with the first difference, if there is one.
     """
     old, new = dict(_flat(before)), dict(_flat(now))
-    differ = [name for name in {**old, **new} if old.get(name, ...) != new.get(name, ...)]
-    # If anything else differs, it explains differences in the entries of levels.
-    differ = [name for name in differ if not name.startswith("levels.")] or differ
-    if differ:
-        lines = [
-            f"{name} was {old.get(name, 'missing')!s:.60}, is {new.get(name, 'missing')!s:.60}"
-            for name in differ[:SHOWN]
-        ]
-        more = f"; and {len(differ) - SHOWN} more" if len(differ) > SHOWN else ""
-        raise ArgumentError(f"state: belongs to another {what}: {'; '.join(lines)}{more}")
+    for name in {**old, **new}:
+        was, is_ = old.get(name, "missing"), new.get(name, "missing")
+        if was != is_:
+            raise ArgumentError(
+                f"state: belongs to another {what}: {name} was {was!s:.60}, is {is_!s:.60}"
+            )
 
 
 def _flat(description: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

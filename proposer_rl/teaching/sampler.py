@@ -11,8 +11,7 @@ from math import inf
 from typing import Any, NamedTuple, TypeVar
 from zlib import crc32
 
-import torch
-from torch import Tensor, distributed
+from torch import distributed
 from torch.utils.data import Sampler
 
 from proposer_rl.settings import ArgumentError, Count, checked
@@ -269,64 +268,6 @@ class TeacherSampler(Sampler[int]):
                 "be those of the loop, and torch.distributed must be initialized on all ranks",
                 stacklevel=4,
             )
-
-
-class MixedGroups(NamedTuple):
-    """Groups whose answers differ, and what they cost.
-
-    Attributes:
-        items: the item of each group, [m].
-        success: success of its answers, float64 [m, G].
-        places: its place among all groups that were generated, in order, int64 [m].
-        rollouts: number of answers that were generated, including those of discarded groups.
-    """
-
-    items: list[int]
-    success: Tensor
-    places: Tensor
-    rollouts: int
-
-
-@checked
-def mixed_groups(
-    teacher: Teacher, count: Count, generate: Callable[[list[int]], Any], *, most: Count = 10
-) -> MixedGroups:
-    """Draws items until enough groups have different answers, as in DAPO's dynamic sampling.
-
-    GRPO learns nothing from a group whose answers are all alike. The teacher then draws another
-    item; the result counts for the curriculum all the same.
-
-    Args:
-        teacher: a teacher of :class:`Items`.
-        count: number of groups with different answers to return.
-        generate: returns for items [n] the success of G answers to each, from 0 to 1, [n, G], with
-            the same G from 2 at every call.
-        most: number of calls of ``generate`` after which fewer groups are returned.
-
-    Raises:
-        ArgumentError: if ``generate`` returns something else; its items are then dropped.
-    """
-    drawn: list[int] = []
-    groups: list[Tensor] = []
-    places: list[int] = []
-    for _ in range(most):
-        tickets, items = teacher.ask(count - len(places))
-        try:
-            size = groups[0].shape[1] if groups else None
-            given = as_numbers("generate", generate(items.tolist()), (len(items), size), 0, 1)
-            success = torch.from_numpy(given)
-            means = success.mean(1)
-            teacher.tell(tickets, means, means, episodes=success.shape[1])
-        finally:
-            teacher.drop(tickets)  # those that could not be told
-        mixed = (success != success[:, :1]).any(1).nonzero().flatten()
-        places += (mixed + len(drawn)).tolist()
-        drawn += items.tolist()
-        groups.append(success)
-        if len(places) == count:
-            break
-    chosen, whole = torch.tensor(places, dtype=torch.int64), torch.cat(groups)
-    return MixedGroups([drawn[place] for place in places], whole[chosen], chosen, whole.numel())
 
 
 def _everywhere(read: Callable[[], list[T]], trace: int) -> list[T]:

@@ -165,29 +165,15 @@ class Parameters(LevelSpace, ParameterSpace):
 
     @property
     def description(self) -> dict[str, Any]:
-        """Describes the parameters, bins, target and named distributions, to compare states by."""
-        named: dict[str, Any] = {name: self._said(part) for name, part in self._parts.items()}
-        target = {"target": named.pop("target")} if "target" in named else {}
-        counts = {name: len(part.low) for name, part in self.bins.items() if part.wide}
-        return {
-            "ranges": self._said(self.bins),
-            "bins": counts,
-            "seeded": self._seeded,
-            **target,
-            "named": named,
+        """Describes the parameters, target and named distributions, to compare states by."""
+        described = {"ranges": self.bins, **self._parts}
+        return {"seeded": self._seeded} | {
+            of: {
+                name: [part.low[0].item(), part.high[-1].item(), len(part.low), str(part)]
+                for name, part in parts.items()
+            }
+            for of, parts in described.items()
         }
-
-    def _said(self, parts: Mapping[str, Bins]) -> dict[str, str]:
-        """Describes each parameter's values as a text."""
-        found = {}
-        for name, part in parts.items():
-            ends = part.low[0].item(), part.high[-1].item()
-            low, high = (str(end).removesuffix(".0") for end in ends)
-            kind = "" if part.low.is_floating_point() else ", whole"
-            said = f"{low} to {high}{kind}" if part.wide else str(part.middles)
-            log = ", log scale" if part.log else ""
-            found[name] = str(part) if isinstance(part, Law) else said + log
-        return found
 
     def rows(self, levels: TensorDictBase) -> list[dict[str, Any]]:
         """Returns levels [n] as dicts of numbers and texts."""

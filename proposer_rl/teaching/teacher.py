@@ -318,7 +318,7 @@ class Teacher:
 
         Args:
             file: a file of JSON Lines to append a line to, for ``bin/report``. The line has the
-                teacher's ``id`` as ``teacher`` and ``levels_told`` since it began, but no levels.
+                teacher's ``id`` as ``teacher`` and ``levels_told`` since it began.
 
         Raises:
             StorageError: if the file cannot be written.
@@ -329,7 +329,6 @@ class Teacher:
             self._levels_told += record["told"]
             if file is not None:
                 kept = {"teacher": self.id, "levels_told": self._levels_told, **record}
-                kept.pop("levels", None)
                 with storage(Path(file)), open(file, "a", encoding="utf-8") as lines:
                     lines.write(json.dumps(kept) + "\n")
             return record

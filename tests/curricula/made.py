@@ -106,11 +106,8 @@ MADE: dict[str, Make] = {
     "regret": lambda: replay("regret", "exact"),
     "plr of regret": lambda: replay("regret", "exact", train_on_new=True),
     "plr of regret, renewed": lambda: replay("regret", "exact", train_on_new=True, renew=True),
-    "plr of regret, credited": lambda: replay(
-        "regret", "exact", train_on_new=True, co_learnability=0.5
-    ),
     "ncc": ncc,
-    "traced": lambda: replay("regret", "exact", co_learnability=0.5, edits=2),
+    "regret, edited": lambda: replay("regret", "exact", edits=2),
     "gradients": lambda: replay("gradient_norm", "exact"),
     "policy gradients": lambda: replay("gradient_norm"),
     "sfl": selection,

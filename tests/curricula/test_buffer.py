@@ -139,12 +139,11 @@ class Simulation:
             if not (known := [score for score in own if isfinite(score)]):
                 continue
             here = {"number": number, "score": sum(known) / len(known), "touched": self.clock}
-            here |= {"best": max(own), "draws": 0, "parent": number + 77}
+            here |= {"best": max(own), "parent": number + 77}
             there = [i for i, slot in enumerate(self.slots) if slot["number"] == number]
             if there:
-                slot = self.slots[there[0]]
-                kept = {"best": max(slot["best"], here["best"]), "draws": slot["draws"]}
-                self.slots[there[0]] = {**here, **kept}
+                here["best"] = max(self.slots[there[0]]["best"], here["best"])
+                self.slots[there[0]] = here
             elif len(self.slots) < self.capacity:
                 self.slots.append(here)
             else:
@@ -162,7 +161,6 @@ class Simulation:
                 break
         self.clock += 1
         self.slots[chosen]["touched"] = self.clock
-        self.slots[chosen]["draws"] += 1
         return chosen
 
 
@@ -191,7 +189,7 @@ def test_it_does_what_a_plain_simulation_does(data: st.DataObject) -> None:
         assert buffer["filled"].tolist() == [True] * n + [False] * (capacity - n)
         here = buffer[:n]
         assert here["level", "a"].tolist() == [slot["number"] for slot in plain.slots]
-        for name in ("score", "touched", "best", "draws", "parent"):
+        for name in ("score", "touched", "best", "parent"):
             assert here[name].tolist() == [slot[name] for slot in plain.slots]
         assert len(set(here["key"].tolist())) == n  # no two equal levels
 
@@ -243,7 +241,6 @@ def test_many_draws_at_once_follow_scores_and_ages() -> None:
     slots = draw_slots(buffer, 20_000, RANK, torch.Generator().manual_seed(0))
     expected, counts = 20_000 * torch.tensor(TOGETHER), slots.bincount(minlength=5)
     assert float(((counts - expected).square() / expected).sum()) < 18.5  # p = 0.001 at 4 degrees
-    assert buffer["draws"][:5].equal(counts)
     last = [20_000 - int(slots.flip(0).eq(slot).nonzero()[0]) for slot in range(5)]
     assert (buffer["touched"][:5] - 5).tolist() == last
 

@@ -158,14 +158,6 @@ def test_children_differ_from_their_parents_by_their_edits() -> None:
     assert found > 4
 
 
-def test_the_lineage_is_the_longest_line_of_edits() -> None:
-    buffer = buffers.empty_buffer(TASK.space.sample(1, torch.Generator())[0], 6)
-    buffer["key"] = torch.tensor([1, 2, 3, 4, 5, 6])
-    buffer["parent"] = torch.tensor([3, 0, 2, 1, 99, 5])  # 2 > 3 > 1 > 4, and 5 > 6
-    buffer["generation"] = torch.tensor([2, 0, 1, 3, 7, 8])
-    assert buffers.lineage(buffer, 6).tolist() == [1, 2, 0, 3]
-
-
 def test_easy_parents_are_those_of_the_lowest_return_minus_loss() -> None:
     learner = solvers([0])
     (lived,) = live([replay()], learner, [0], range(1))
@@ -198,39 +190,9 @@ def test_the_distribution_of_ncc_is_a_softmax_over_renewed_scores() -> None:
     torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
 
 
-def test_credit_goes_to_the_levels_trained_on_before() -> None:
-    """By a plain loop over batches of many sizes; one level of each batch is evicted after it."""
-    rule = {"train_on_new": True, "capacity": 8, "replay_probability": 1.0}
-    curriculum = replay("regret", co_learnability=0.5, **rule)
-    last: set[int] = set()
-    raised = 0.0
-    for number, count in enumerate([8, 5, 3, 6, 6, 1, 7]):
-        batch = curriculum.propose(c.Student(), count, Streams(0, number))
-        score = torch.rand(count, generator=Streams(0, number).generator("score"))
-        before = curriculum.buffer["score"].clone()
-        outcome = TensorDict({"return": torch.zeros_like(score), "score": score}, [count])
-        curriculum.observe(c.Student(), batch, outcome)
-        if number == 0:  # which fills the buffer
-            continue
-        assert bool(batch.notes["replayed"].all())
-        expected, slots = before.tolist(), batch.notes["slot"].tolist()
-        for slot in {*slots}:
-            told = [float(new) for new, where in zip(score, slots, strict=True) if where == slot]
-            expected[slot] = sum(told) / len(told)
-        fell = sum(float(before[slot]) - expected[slot] for slot in slots) / len(slots)
-        for slot in last:
-            expected[slot] += 0.5 * fell
-            raised += abs(fell)
-        assert curriculum.buffer["score"].tolist() == pytest.approx(expected)
-        last = {*slots[1:]} - {slots[0]}
-        curriculum.buffer["key"][slots[0]] += 1
-    assert raised > 1
-
-
-def test_what_is_logged_shows_levels() -> None:
+def test_the_log_is_of_the_buffer() -> None:
     told = live([accel()], solvers([0]), [0], range(7))[0].told
-    assert told[0] == {} and set(told[-1]["levels"]) > {"highest scores", "most replayed"}
-    assert all(TASK.record(some, None) for some in told[-1]["levels"].values())
+    assert told[0] == {}
     assert told[-1]["replayed"] == 1 and 1 <= told[-1]["effective_levels"] <= 16
 
 
@@ -275,7 +237,6 @@ def test_the_best_are_kept_and_half_of_a_batch_is_drawn_from_them() -> None:
     assert all(key in keys[best].tolist() for key in drawn[:2])
     told = curriculum.log()
     assert told["highest_score"] >= told["mean_score"] >= told["lowest_kept_score"]
-    assert buffers.level_keys(told["levels"]["highest scores"]).tolist() == keys[best].tolist()
 
 
 def test_the_best_that_have_a_score_are_kept() -> None:

@@ -330,22 +330,6 @@ def test_it_fits_a_phone_and_everything_has_a_name(
                 assert tab.evaluate("document.documentElement.lang") == "en"
 
 
-def test_another_page_gets_nothing_even_with_the_token(context: BrowserContext, page: Page) -> None:
-    tab = context.new_page()
-    tab.goto("data:text/html,<h1>A page of somebody else's</h1>")
-    ask = """async ([address, options]) => {
-        try { return (await fetch(address, options)).status; } catch (error) { return error.name; }
-    }"""
-    body = '{"source": "set", "name": "shapes"}'
-    assert tab.evaluate(ask, [f"{page.address}api/run", {}]) == "TypeError"
-    for kind in ("text/plain", "application/json"):
-        options = {"method": "POST", "body": body, "headers": {"Content-Type": kind}}
-        assert tab.evaluate(ask, [f"{page.address}api/levels", options]) == "TypeError"
-    tab.set_content(f'<iframe src="{page.address}"></iframe><script src="{page.address}play.js">')
-    tab.wait_for_load_state("networkidle")
-    assert all("gallery" not in frame.content() for frame in tab.frames[1:])
-
-
 @pytest.mark.slow
 def test_a_maze_seen_through_a_window_is_drawn_watched_and_played(view_tab: Tab) -> None:
     tab, status = view_tab, view_tab.locator("#status")

@@ -35,7 +35,6 @@ TASK: dict[str, Any] = {
     "space": {"obstacle fraction": [0.0, 0.2], "path length": [2, 3, 4]},
     "about": {"Mazes": "2×4, at most 9 steps"},
     "measured": {"id": [[0.1, 3]], "levels": 8},
-    "samples": {"id": [LEVEL] * 2, "ood": [LEVEL]},
     "levels": "mazes",
     "key": "Blue: start.",
     "text_key": "S start, G goal",
@@ -46,7 +45,6 @@ ROCKETS: dict[str, Any] = {
     "distributions": ["target"],
     "space": {"thrust": [1, 2, 4, 8]},
     "measured": 3,
-    "samples": {"target": [{"picture": png(np.full((8, 8, 3), 99))}]},
     "levels": "rockets",
 }
 

@@ -139,7 +139,7 @@ def test_one_usual_baseline_is_enough(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_report_of_several_tasks_begins_with_all_of_them(runs: Path, tmp_path: Path) -> None:
-    main([str(runs), "-q", "-o", str(tmp_path / "out")])
+    main([str(runs), "-o", str(tmp_path / "out")])
     page = (tmp_path / "out/report.html").read_text(encoding="utf-8")
     assert page.index('id="arena"') < page.index('id="study-1"')
     text = (tmp_path / "out/report.md").read_text(encoding="utf-8")

@@ -66,7 +66,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def data(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(build, "DRAWINGS", [])
-        written = write_report([runs], tmp_path_factory.mktemp("out") / "report", progress=False)
+        written = write_report([runs], tmp_path_factory.mktemp("out") / "report")
     (found,) = page_data(written)
     return found
 
@@ -127,7 +127,7 @@ def test_what_is_not_known_is_null(tmp_path: Path) -> None:
     """A short run leaves a median that is not of all, and few seeds have no interval."""
     write_run(tmp_path / "a", seeds=[0])
     write_run(tmp_path / "b", seeds=[1], curve=[0.0, 0.1], finished=False)
-    (data,) = page_data(write_report([tmp_path], tmp_path / "out", progress=False))
+    (data,) = page_data(write_report([tmp_path], tmp_path / "out"))
     (series,) = by_name(data["measures"], "ID success rate")["axes"][UPDATES]
     assert series == {
         "x": [0, 10, 20],
@@ -149,7 +149,7 @@ def test_stages_move_proposals_levels_and_success_together(tmp_path: Path) -> No
     task = {**TASK, "space": {"ground": ["flat", "stairs"], "path length": [2, 3, 4]}}
     write_run(tmp_path / "p", "perf_gain", [4], curve, cycles=cycles, task=task)
     write_run(tmp_path / "t", "target", [4], curve, task=task)
-    (data,) = page_data(write_report([tmp_path], tmp_path / "out", progress=False))
+    (data,) = page_data(write_report([tmp_path], tmp_path / "out"))
     found, plain = data["stages"]["methods"]
     assert found["curve"] == [[0, 10, 20, 30], curve]
     assert [stage["updates"] for stage in found["stages"]] == [10, 20, 30]
@@ -165,7 +165,7 @@ def test_stages_move_proposals_levels_and_success_together(tmp_path: Path) -> No
     assert axes == {"ground": ["flat", "stairs"], "path length": [2, 3, 4]}
     # Without levels, as in a published study, the map moves alone.
     (tmp_path / "p" / "curriculum.jsonl").unlink()
-    (data,) = page_data(write_report([tmp_path], tmp_path / "out", progress=False))
+    (data,) = page_data(write_report([tmp_path], tmp_path / "out"))
     alone = data["stages"]["methods"][0]["stages"]
     assert [stage["map"] and stage["map"][0][0] for stage in alone] == [1, 0]
     assert [(stage["updates"], stage["levels"]) for stage in alone] == [(0, []), (20, [])]
@@ -206,7 +206,7 @@ def test_a_page_of_many_long_runs_stays_small(tmp_path: Path) -> None:
         sample = [{"picture": png(random.integers(0, 256, (40, 40, 3)))} for _ in range(4)]
         lines = [{"updates": 10 * i, "seed": 0, "levels": sample} for i in range(1, 76)]
         write_jsonl(tmp_path / f"m{number}-0" / "curriculum.jsonl", lines)
-    written = write_report([tmp_path], tmp_path / "out", progress=False)
+    written = write_report([tmp_path], tmp_path / "out")
     (data,) = page_data(written)
     assert len(data["methods"]) == 9
     assert len(data["measures"][0]["axes"][UPDATES][0]["rows"]) == 5
@@ -231,7 +231,7 @@ def test_pictures_that_are_too_large_are_fewer_or_none(tmp_path: Path) -> None:
             for i in range(12)
         ]
         write_jsonl(folder / "curriculum.jsonl", lines)
-        (data,) = page_data(write_report([folder], tmp_path / f"o{count}", progress=False))
+        (data,) = page_data(write_report([folder], tmp_path / f"o{count}"))
         shown = data["stages"] and data["stages"]["methods"][0]["stages"]
         assert (shown and len(shown)) == expected
 
@@ -243,8 +243,8 @@ def test_shares_of_batches_are_curves_over_updates(tmp_path: Path) -> None:
     write_run(tmp_path / "run", cycles=cycles)
     (study,), _ = read_studies([tmp_path / "run"], None)
     found = {one.name: one for one in own_numbers(study)}
-    series = found["share of the batch: way"].axes[UPDATES](study.groups[0])
-    assert found.keys() == {"share of the batch: way", "share of the batch: rest"}
+    series = found["shares/way"].axes[UPDATES](study.groups[0])
+    assert found.keys() == {"shares/way", "shares/rest"}
     assert all(one.rate for one in found.values())
     assert series is not None and series.columns.tolist() == [0, 10, 20]
     np.testing.assert_allclose(series.to_numpy()[0], [0.3, np.nan, 0.5])

@@ -9,14 +9,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from proposer_rl.report.statistics import (
     Interval,
     difference_of,
     mean_of,
-    median_of,
-    probability_of_improvement,
 )
 
 REPLICATIONS, ENOUGH = 2000, 0.93
@@ -54,25 +51,6 @@ def test_intervals_of_means_cover(name: str, seeds: int) -> None:
     assert covered(found, mean_under(LAWS[name])) >= ENOUGH
 
 
-@pytest.mark.parametrize("seeds", [5, 6, 7, 8, 9, 10, 20])
-@pytest.mark.parametrize("law", ["normal", "lognormal", "near 1", "one in five fails", "constant"])
-def test_intervals_of_medians_cover_whatever_the_law(law: str, seeds: int) -> None:
-    rng, shape = np.random.default_rng(0), (seeds, 20_000)
-    drawn, truth = {
-        "normal": (rng.normal(0.5, 0.1, shape), 0.5),
-        "lognormal": (rng.lognormal(0, 0.65, shape), 1.0),
-        "near 1": (1 - rng.exponential(0.02, shape), 1 - 0.02 * np.log(2)),
-        # The median of the whole is the 0.3 / 0.8 quantile of the runs that do not fail.
-        "one in five fails": (
-            np.where(rng.random(shape) < 0.2, 0.0, rng.uniform(0.8, 1.0, shape)),
-            0.8 + 0.2 * 0.3 / 0.8,
-        ),
-        "constant": (np.full(shape, 240.0), 240.0),
-    }[law]
-    _, low, high = median_of(drawn)
-    assert np.mean((low <= truth) & (truth <= high)) >= ENOUGH - 0.003
-
-
 @pytest.mark.parametrize("seeds", [5, 10])
 @pytest.mark.parametrize("paired", [False, True])
 @pytest.mark.parametrize("name", LAWS)
@@ -84,16 +62,3 @@ def test_intervals_of_differences_cover(name: str, paired: bool, seeds: int) -> 
     for other, truth in ((same, 0.0), (steady, mean_under(law) - 0.5)):
         found = [difference_of(a, b, paired).interval() for a, b in zip(one, other, strict=True)]
         assert covered(found, truth) >= ENOUGH
-
-
-@pytest.mark.parametrize("seeds", [5, 10])
-@pytest.mark.parametrize("spread", [0.1, 1.0])
-@pytest.mark.parametrize("probability", [0.5, 0.7, 0.9, 0.97])
-def test_intervals_of_an_improvement_cover(probability: float, spread: float, seeds: int) -> None:
-    rng = np.random.default_rng(0)
-    shift = stats.norm.ppf(probability) * np.hypot(spread, 1.0)
-    one = rng.normal(shift, spread, (REPLICATIONS, seeds))
-    other = rng.normal(0, 1, (REPLICATIONS, seeds))
-    found = [probability_of_improvement(a, b) for a, b in zip(one, other, strict=True)]
-    assert covered(found, probability) >= ENOUGH
-    assert all(interval.high - interval.low > 0.1 for interval in found)

@@ -78,18 +78,6 @@ def between(one: pd.Series, other: pd.Series) -> tuple[float, float, float, floa
     return value, *test.confidence_interval(), test.pvalue
 
 
-def improvement(one: pd.Series, other: pd.Series) -> tuple[float, float, float]:
-    """Mann's and Whitney's statistic as a share, with Clopper's and Pearson's interval."""
-    count = min(len(one), len(other))
-    share = stats.mannwhitneyu(one, other, method="asymptotic").statistic / (len(one) * len(other))
-    if count < FEWEST:
-        return share, math.nan, math.nan
-    wins = share * count
-    low = stats.beta.ppf(0.025, wins, count - wins + 1) if wins else 0
-    high = stats.beta.ppf(0.975, wins + 1, count - wins) if wins < count else 1
-    return share, low, high
-
-
 def holm(p: pd.Series) -> pd.Series:
     """By the definition: the largest q among those up to p, each times how many are not below q."""
     steps = p.map(lambda q: q * (p >= q).sum())
@@ -129,10 +117,6 @@ def check(metrics: pd.DataFrame, methods: pd.DataFrame, pairs: pd.DataFrame, rel
     for _, row in table.iterrows():
         shown = [row["difference"], row["difference, low"], row["difference, high"]]
         assert shown == pytest.approx([row["value"], row["low"], row["high"]], **near)
-        sign = -1 if row["outcome"] == runs.columns[1] else 1
-        values = [sign * of[row[side]][row["outcome"]] for side in ("first", "second")]
-        shown = [row[f"P(first better){part}"] for part in ("", ", low", ", high")]
-        assert shown == pytest.approx(improvement(*values), **near)
         # A p-value of millions of differences tells their rounding: its exponent must be right.
         assert row["p (Holm)"] == pytest.approx(row["corrected"], rel=200 * rel, nan_ok=True)
         if str(row["verdict"]).endswith(" is better"):

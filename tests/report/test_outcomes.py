@@ -7,7 +7,6 @@ import io
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from proposer_rl.report.outcomes import answer, group_table, run_table
@@ -45,10 +44,6 @@ def study_of(folder: Path, seeds: int = SEEDS, **curves: list[float]) -> Study:
     return read_studies(sorted(folder.iterdir()), None)[0][0]
 
 
-def curve_last(base: list[float]) -> list[float]:
-    return [curve_of(base, seed)[-1] for seed in range(SEEDS)]
-
-
 def test_the_group_table_has_the_numbers(tmp_path: Path) -> None:
     study = study_of(tmp_path, perf_gain=FAST, target=SLOW)
     table = group_table(study)
@@ -58,12 +53,7 @@ def test_the_group_table_has_the_numbers(tmp_path: Path) -> None:
     (updates,) = (name for name in table.columns if name.startswith("updates to"))
     assert rows["perf_gain"][updates].estimate == 30
     assert write(rows["target"][updates]) == "50.0"  # nobody got there
-    worst = rows["target"]["ID success, worst 10 %"]
-    assert worst.estimate == pytest.approx(np.median(curve_last(SLOW)) / 2)
-    # What nobody decides by is for who reads the CSV.
-    assert "worst 10 %" in table.to_csv() and "worst" not in table.to_markdown()
-    assert "P(better" in table.to_csv() and "P(better" not in table.to_markdown()
-    assert len(table.columns) == len(table.texts()[0]) == len(table.rows[0]) - 2
+    assert len(table.columns) == len(table.texts()[0]) == len(table.rows[0])
     assert rows["perf_gain"]["evaluations"] == 150
     assert rows["perf_gain"]["with the curriculum's (M)"] == pytest.approx(50 * 700 / 1e6)
 

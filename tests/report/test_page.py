@@ -10,7 +10,7 @@ import pytest
 
 from proposer_rl.report import build
 from proposer_rl.report.build import write_report
-from proposer_rl.report.figures import cost_curves
+from proposer_rl.report.figures import learning_curves
 from tests.browser import chromium, needs_chromium, new_context
 from tests.report.folders import LEVEL, PIXELS, cycle, png, write_jsonl, write_run
 
@@ -51,8 +51,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def written(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build, "DRAWINGS", [cost_curves])
-        return write_report([runs], tmp_path_factory.mktemp("out") / "report", progress=False)
+        patch.setattr(build, "DRAWINGS", [learning_curves])
+        return write_report([runs], tmp_path_factory.mktemp("out") / "report")
 
 
 class Seen:
@@ -113,7 +113,7 @@ def test_what_is_ticked_is_compared_alone_and_in_colour(
     assert {trace["name"] for trace in seen.traces(".curves", "band")} == coloured
     seen.tick(".against", "target")
     assert [trace["name"] for trace in seen.traces(".curves", "rest")] == ["perf_gain"]
-    planned = write_report([runs], tmp_path, progress=False, compare=["target", HOSTILE])
+    planned = write_report([runs], tmp_path, compare=["target", HOSTILE])
     page = seen.page.context.new_page()
     page.goto(planned.as_uri())
     page.wait_for_selector("html[data-ready]")
@@ -167,27 +167,8 @@ def test_values_are_told_where_the_pointer_is(seen: Seen) -> None:
     assert "perf_gain" in text and "0.825 [0.8, 0.85]" in text
 
 
-def test_two_methods_are_compared_level_by_level(seen: Seen) -> None:
-    page = seen.page
-    options = page.locator(".up option").all_text_contents()
-    assert sorted(options) == sorted([HOSTILE, "target"])  # perf_gain does not tell
-    page.select_option(".up", label="target")
-    page.select_option(".across", label=HOSTILE)
-    (dots,) = seen.traces(".single", "levels")
-    assert dots["x"] == pytest.approx([0, 0.5, 0.925])
-    assert dots["y"] == pytest.approx([0.1, 0.5, 0.725])
-    assert page.locator(".shares").inner_text() == "better on 33 %, worse on 33 %"
-    page.locator(".single").scroll_into_view_if_needed()
-    left, top = page.evaluate(PIXEL, [".single", 0.925, 0.725])
-    for steps in range(3):
-        page.mouse.move(left - 5 + steps, top)
-    page.wait_for_selector(".single .hoverlayer .hovertext")
-    text = page.locator(".single .hoverlayer").text_content()
-    assert "number 2" in text and "target: 0.725" in text and "0.925" in text
-
-
 def test_the_gains_of_the_copies_are_told(seen: Seen) -> None:
-    seen.page.select_option(".measure", label="total gain in log success, maximum of the replicas")
+    seen.page.select_option(".measure", label="log success gain max")
     means = {trace["name"]: trace["y"] for trace in seen.traces(".curves", "median")}
     assert means == {"perf_gain": [0.2, 0.2]}
     seen.page.select_option(".measure", label="ID success rate")

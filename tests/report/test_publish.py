@@ -32,8 +32,7 @@ def without_figures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
 @pytest.fixture
 def runs(tmp_path: Path) -> Path:
     """Five seeds of two methods, with pictures wherever there can be any."""
-    told = {"levels": {"the best": [LEVEL] * 2}}
-    cycles = [{**cycle(i, [0.1, 0.2], [[8 - i, 1, 1], [1, 1, 1 + i]]), **told} for i in range(2)]
+    cycles = [cycle(i, [0.1, 0.2], [[8 - i, 1, 1], [1, 1, 1 + i]]) for i in range(2)]
     curves = {"perf_gain": [0.0, 0.8, 0.9], "target": [0.0, 0.3, 0.6]}
     arguments = {"config_dir": f"{SECRET}/conf", "pythonpath": SECRET}
     reused = f"{SECRET}/runs/5/checkpoints"
@@ -74,7 +73,7 @@ def test_tables_of_the_study_are_those_of_the_runs(
     light = published(runs, tmp_path / "light")
     tables = {}
     for name, folder in {"before": runs, "after": light}.items():
-        report([str(folder), "-o", str(tmp_path / name), "-q"])
+        report([str(folder), "-o", str(tmp_path / name)])
         tables[name] = contents(tmp_path / name / "tables") | contents(tmp_path / name / "figures")
     assert {"levels.csv", "cycles.csv", "metrics.csv"} < tables["before"].keys()
     assert tables["after"] == tables["before"]

@@ -8,7 +8,7 @@ import statistics
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -21,7 +21,6 @@ from proposer_rl.report.statistics import (
     mean_of,
     median_interval,
     median_of,
-    probability_of_improvement,
     seeds_needed,
 )
 
@@ -81,28 +80,10 @@ def test_too_few_runs_and_runs_without_spread_have_no_interval() -> None:
     many = [1.0, 2.0, 3.0, 4.0, 5.0]
     assert math.isnan(difference_of([1.0, 3.0], many).p)
     assert math.isnan(difference_of([1.0] * 5, [2.0] * 5).p)
-    assert math.isnan(probability_of_improvement([1.0] * 4, many).low)
     assert seeds_needed(mean_of([1.0, 2.0]), 2, 0.05) is None
 
 
 small = st.lists(st.integers(0, 5), min_size=FEWEST, max_size=8)
-
-
-@settings(max_examples=30)
-@given(small, small)
-def test_improvement_counts_pairs_and_half_of_ties(one: list[int], other: list[int]) -> None:
-    wins = sum((a > b) + (a == b) / 2 for a in one for b in other)
-    found, turned = probability_of_improvement(one, other), probability_of_improvement(other, one)
-    assert found.estimate == pytest.approx(wins / len(one) / len(other))
-    assert 0 <= found.low <= found.estimate <= found.high <= 1
-    assert found.high - found.low > 0.2
-    assert (turned.low, turned.high) == pytest.approx((1 - found.high, 1 - found.low))
-
-
-def test_the_interval_of_an_improvement_is_that_of_a_share() -> None:
-    found = probability_of_improvement([3, 3, 3, 3, 0] * 2, [1] * 30)
-    known = stats.binomtest(8, 10).proportion_ci(method="exact")
-    assert found[1:] == pytest.approx((known.low, known.high))
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=6))

@@ -259,5 +259,5 @@ def test_seeds_trained_together_have_one_curriculum(tmp_path: Path) -> None:
     write_run(tmp_path / "b", "plr", [2], cycles=[{"updates": 0, "score": 2}])
     (study,), _ = read(tmp_path)
     (group,) = study.groups
-    assert group.seeds == [0, 1, 2] and not group.proposes
+    assert group.seeds == [0, 1, 2]
     assert sorted(run.folder.name for run in group.logs) == ["a", "b"]

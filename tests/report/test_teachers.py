@@ -39,7 +39,7 @@ def test_the_page_has_the_entries_of_all_logs_and_what_was_drawn(tmp_path: Path)
     assert bins == list(rows[0]["drawn"]["<b>gravity"])
     assert (shares * 12).round().tolist() == [list(r["drawn"]["<b>gravity"].values()) for r in rows]
     assert [len(one.panels) for one in drawings({"plr": found})] == [len(found.entries), 2]
-    main([*map(str, files), "-q", "-o", str(tmp_path / "page")])
+    main([*map(str, files), "-o", str(tmp_path / "page")])
     page = (tmp_path / "page" / "report.html").read_text(encoding="utf-8")
     assert page.count('src="data:image/png') == 3
     assert "&lt;i&gt;uniform" in page and not re.search("<[ib]>", page.partition("<script")[0])
@@ -52,7 +52,7 @@ def test_logs_stand_on_the_page_of_runs(tmp_path: Path) -> None:
     write_run(tmp_path / "run")
     write_jsonl(tmp_path / "mine.jsonl", [{"told": 4, "drawn": {}, "mean_return": 1}])
     given = [str(tmp_path / name) for name in ("run", "mine.jsonl")]
-    main([*given, "-q", "-o", str(tmp_path / "page")])
+    main([*given, "-o", str(tmp_path / "page")])
     page = (tmp_path / "page" / "report.html").read_text(encoding="utf-8")
     assert 'id="study-1"' in page and 'id="teachers"' in page
     text = (tmp_path / "page" / "report.md").read_text(encoding="utf-8")
@@ -80,7 +80,7 @@ def test_two_teachers_of_one_file_have_a_curve_each(tmp_path: Path) -> None:
     assert [[*log.drawn["a"][0]] for log in logs.values()] == [["low"], ["high"]]
     assert read_log(file).x.tolist() == [10, 20, 30, 10, 20]
     assert len(notes) == 1 and "plr has 2 curves" in notes[0]
-    main([str(file), "-q", "-o", str(tmp_path / "page")])
+    main([str(file), "-o", str(tmp_path / "page")])
     assert notes[0] in (tmp_path / "page" / "report.html").read_text(encoding="utf-8")
 
 
@@ -136,7 +136,7 @@ def test_shares_of_batches_are_entries_by_name(tmp_path: Path) -> None:
     rows = [{"told": 4, "drawn": {}, "shares": shares} for shares in ({"way": [0.2, 0.4]}, None)]
     write_jsonl(tmp_path / "x.jsonl", rows)
     found = read_log(tmp_path / "x.jsonl").entries
-    np.testing.assert_allclose(found["share: way"], [0.3, np.nan])
+    np.testing.assert_allclose(found["shares/way"], [0.3, np.nan])
 
 
 def test_logs_of_one_name_are_told_apart(tmp_path: Path) -> None:

@@ -32,7 +32,6 @@ from research.benchmarks.scales import PAPER, QUICK, TINY, Solvers
 from research.benchmarks.timing import interleave, ratio, threads
 from research.timing import read_timing
 from tests.commands import call
-from tests.report.folders import write_run
 
 TRIED = Options(repeats=1, precision="fp32", size="tiny")
 
@@ -105,18 +104,6 @@ def test_memory_is_a_process_s_own_and_not_that_of_the_one_which_started_it() ->
     assert 0.9 * 2**26 < after - before < 2**27
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["level"], "error: unknown benchmark 'level'; choose among: levels, "),
-        (["gymnasium", "--environments", "Pong-v5"], "Pong-v5: must be among CartPole-v1, Lunar"),
-    ],
-)
-def test_bad_input_is_told_in_one_line(bench, capsys, arguments, message) -> None:
-    assert bench(*arguments) == 2
-    assert message in capsys.readouterr().err.splitlines()[-1]
-
-
 @pytest.mark.slow
 def test_methods_of_runs_are_timed_in_turns(
     bench, train, capsys, monkeypatch, tmp_path: Path
@@ -131,21 +118,6 @@ def test_methods_of_runs_are_timed_in_turns(
     timing = read_timing([tmp_path / "bench.json"])
     assert set(timing.seconds) == {"domain_randomization", "perf_gain"}
     assert timing.machine.endswith(", threads: 1")
-
-
-def test_runs_that_cannot_be_timed_get_one_line(bench, capsys, tmp_path: Path) -> None:
-    write_run(tmp_path / "alone" / "a", "target", [0], [0.0, 0.5])
-    write_run(tmp_path / "two" / "a", "target", [0], [0.0, 0.5])
-    write_run(tmp_path / "two" / "b", "plr", [0], [0.0, 0.5])
-    for arguments, message in {
-        ("levels", "--runs", "two"): "is for the benchmark curricula, not for levels",
-        ("curricula", "--runs", "nowhere"): "nowhere: there is no such folder",
-        ("curricula", "--runs", "alone"): "the runs are of one method",
-        ("curricula", "--runs", "two"): "not the settings of a run",
-    }.items():
-        assert bench(*arguments) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith("error: --runs: ") and message in line
 
 
 def test_what_was_trained_before_is_not_trained_again(tmp_path: Path) -> None:

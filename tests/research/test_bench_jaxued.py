@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -13,13 +12,11 @@ import pytest
 import torch
 
 from proposer_rl.tasks.view_mazes.view_levels import ViewLevel
-from research.benchmarks.__main__ import main
 from research.benchmarks.jaxued_peer import TRAINING, WAYS
 from research.benchmarks.peer import jaxued_maze, played
 from research.benchmarks.timing import threads
 from research.benchmarks.view import MAX_STEPS, beside_jaxued, through_minigrid
 from research.benchmarks.view_training import SMALL
-from tests.commands import call
 from tests.tasks.view_mazes.oracles import random_levels
 
 DRAWINGS = ["v#..\n.#G.", "..<#\nG...", "G#.^\n....", "...G\n.>#."]
@@ -36,30 +33,6 @@ for i, drawing in enumerate(sys.argv[2:]):
     for name in ("wall_map", "goal_pos", "agent_pos", "agent_dir"):
         np.testing.assert_array_equal(given[name][i], getattr(level, name), strict=True)
 """
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["view", "--jaxued", sys.executable], "No module named 'jaxued'; must be an interpreter"),
-        (
-            ["meta", "levels", "--jaxued", "p"],
-            "is for the benchmark view and view_training, not for meta, levels",
-        ),
-        (
-            ["teacher", "--syllabus", sys.executable],
-            "No module named 'syllabus'; must be an interp",
-        ),
-    ],
-)
-def test_refused_before_anything_is_measured(
-    monkeypatch, capsys, tmp_path: Path, arguments: list[str], message: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert call(main, *arguments) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(("error: --jaxued ", "error: --syllabus ")) and message in line
-    assert not (tmp_path / "bench.json").exists()
 
 
 def test_levels_are_given_as_jaxued_has_them() -> None:

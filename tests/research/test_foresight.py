@@ -38,11 +38,6 @@ def test_the_interval_covers_no_correlation_where_there_is_none() -> None:
     assert covered >= 16  # 19 of 20 on average
 
 
-def test_three_proposals_are_too_few() -> None:
-    with pytest.raises(ValueError, match="at least 4 proposals are needed, got 3"):
-        agreement(np.arange(3.0), np.arange(3.0))
-
-
 def growing(rates: torch.Tensor):
     """In place of training: after n updates the logarithms of success + 0.001 grew by n mixes."""
 

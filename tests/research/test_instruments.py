@@ -44,18 +44,6 @@ def test_signal_and_noise_of_every_checkpoint(run: Path, tmp_path: Path, capsys)
     assert json.loads(output.read_text()) == rows
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["nowhere"], "nowhere: holds no checkpoints"),
-        (["{run}", "--copies", "1"], "--copies: must be a whole number of at least 2, got '1'"),
-    ],
-)
-def test_snr_refuses_in_one_line(run: Path, arguments: list[str], message: str, capsys) -> None:
-    assert call(snr, *(argument.format(run=run) for argument in arguments)) == 2
-    assert message in capsys.readouterr().err
-
-
 def test_look_shows_every_stage_and_what_changes(run: Path, tmp_path: Path, capsys) -> None:
     output = tmp_path / "look.json"
     assert call(look, str(run), str(run), "--output", str(output)) == 0
@@ -86,11 +74,3 @@ def test_look_shows_the_first_of_several_solvers(run: Path, tmp_path: Path) -> N
         assert call(look, str(run), str(folder), "--output", str(output)) == 0
         rows.append([row["distance"] for row in json.loads(output.read_text())])
     assert rows[0] == pytest.approx(rows[1], abs=1e-3) and len(rows[0]) > 2
-
-
-def test_look_refuses_a_run_without_a_proposer(tmp_path: Path, capsys) -> None:
-    folder = tmp_path / "target"
-    assert call(train, "+method=target", *SMOKE, f"hydra.run.dir={folder}") == 0
-    capsys.readouterr()
-    assert call(look, str(folder), str(folder)) == 2
-    assert "belongs to another network" in capsys.readouterr().err

@@ -15,7 +15,6 @@ from scipy import integrate, stats
 
 from proposer_rl.cli.help import needs
 from proposer_rl.recipes import CONFIG_FOLDER
-from proposer_rl.report.figures import cost_curves, learning_curves
 from proposer_rl.report.reading import UnreadableRun
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.style import Drawing
@@ -28,7 +27,7 @@ from research.generalisation import (
     read_scores,
     write_scores,
 )
-from research.pages import CHOICE, CLAIMS, main
+from research.pages import CHOICE, CLAIMS, difficulty, main
 from research.ranking import EXACT, STEADY, budgets, choices, needs_of
 from research.timing import read_timing, timed
 from tests.report.folders import TASK, cycle, write_rockets, write_run, write_seconds
@@ -65,10 +64,6 @@ def write_methods(
 
 def study_of(folder: Path) -> Study:
     return read_studies(sorted(folder.iterdir()), None)[0][0]
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 @pytest.fixture(scope="module")
@@ -230,24 +225,6 @@ def test_our_claims_hold_where_they_are_true(tmp_path: Path) -> None:
     assert "supported" not in verdicts(study)
 
 
-@pytest.mark.slow
-def test_the_same_runs_give_the_same_pages(
-    runs: Path, pages: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("research.pages.DRAWINGS", [learning_curves, cost_curves])
-    folders = sorted(map(str, runs.iterdir()), reverse=True)
-    command = f"bin/research pages {runs} -o {pages}"  # as it can be given again
-    before = contents(pages)
-    assert set(before) >= {CHOICE, CLAIMS, "figures/cost.png", "figures/proposals.png"}
-    main([*folders, "-o", str(tmp_path / "again")])
-    after = contents(tmp_path / "again")
-    assert [name for name in after if name.endswith(".png") and after[name] != before[name]] == []
-    texts = [found[CHOICE].decode().splitlines() for found in (before, after)]
-    assert command in texts[0]
-    one, other = ([line for line in text if "bin/research" not in line] for text in texts)
-    assert one == other
-
-
 def test_the_pages_say_what_was_found(pages: Path) -> None:
     text = (pages / CHOICE).read_text(encoding="utf-8")
     assert "| **perf\\_gain** 0." in text and "better than all others (" in text
@@ -277,14 +254,6 @@ def test_other_levels_are_told_by_method(runs: Path, tmp_path: Path) -> None:
     assert of["target"]["big, new"] is None
     worst = of["ncc"]["OOD success on the worst 10 %"].estimate  # type: ignore[union-attr]
     assert worst == pytest.approx(0.45 * np.mean([1 - 0.01 * seed for seed in range(SEEDS)]))
-
-
-@pytest.mark.parametrize("content", ["a,b\n1,2\n", "run,seed\na,1\n", "\xe9"])
-def test_what_holds_no_scores_is_told_in_one_line(content: str, tmp_path: Path) -> None:
-    (file := tmp_path / "scores.csv").write_bytes(content.encode("latin-1"))
-    with pytest.raises(UnreadableRun, match=r"scores\.csv: holds no scores of runs") as refused:
-        read_scores(file)
-    assert len(str(refused.value).splitlines()) == 1
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -433,8 +402,6 @@ def test_runs_that_were_not_measured_alike_are_refused(runs: Path, tmp_path: Pat
     wrong = {
         "were not measured alike": [str(tmp_path / "rockets"), str(runs), "-o", "new"],
         f"and has no {CHOICE}": [str(runs), "-o", str(tmp_path / "mine")],
-        "--baseline=nobody: must be one of": [str(runs), "--baseline=nobody", "-o", "new"],
-        "--threshold=80: must be above 0": [str(runs), "--threshold=80", "-o", "new"],
     }
     for message, arguments in wrong.items():
         with pytest.raises(SystemExit) as end:
@@ -442,12 +409,6 @@ def test_runs_that_were_not_measured_alike_are_refused(runs: Path, tmp_path: Pat
         assert end.value.code == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("error: ") and message in line
-
-
-def test_a_claim_of_methods_that_are_missing_is_not_decided(tmp_path: Path) -> None:
-    runs = write_methods(tmp_path, {"first_order_gain": FASTEST, "paired": SLOW, "target": FLAT})
-    (study,), _ = read_studies(sorted(runs.iterdir()), None)
-    assert own_claims(study, NEEDS)[0][1] is None
 
 
 def test_two_runs_of_one_name_are_not_taken_for_one(tmp_path: Path) -> None:
@@ -464,3 +425,14 @@ def test_performance_that_is_played_is_no_exact_evaluation(tmp_path: Path) -> No
         write_run(tmp_path / str(exact), "mine", task=task)
         (study,), _ = read_studies([tmp_path / str(exact)], None)
         assert (EXACT in needs_of(study.groups[0], {})) == exact
+
+
+def test_a_legend_has_the_methods_that_are_drawn(tmp_path: Path) -> None:
+    """Not those whose runs keep no levels, or no table of what the Solver trained on."""
+    write_run(tmp_path / "full", "target", levels=[0.5])
+    write_run(tmp_path / "bare", "plr")
+    (tmp_path / "bare" / "training.csv").unlink()
+    study = read_studies([tmp_path / "full", tmp_path / "bare"], None)[0][0]
+    assert set(study.legend) == {"target", "plr"}
+    drawing = difficulty(study)
+    assert drawing is not None and drawing.legend == {"target": study.legend["target"]}

@@ -176,26 +176,6 @@ def test_what_is_no_table_is_refused_by_line(
         read(tmp_path / "table")
 
 
-@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
-def test_tables_with_the_line_ends_and_marks_of_windows_are_read_and_added_to(
-    folder: RunFolder, mark: bytes
-) -> None:
-    """As Excel or ``git config core.autocrlf`` leave them."""
-    _filled(folder, 3)
-    for path in folder.path.iterdir():
-        path.write_bytes(mark + path.read_bytes().replace(b"\n", b"\r\n"))
-    lengths = folder.lengths()
-    _filled(folder, 1)
-    folder.cut_back(lengths)
-    assert folder.lengths() == {"metrics.csv": 3, "cycles.jsonl": 3}
-    folder.append("metrics.csv", {"update": 3, "loss": 9.0})
-    assert read_csv(folder.path / "metrics.csv")[2:] == [
-        {"update": 2, "loss": 2 / 7},
-        {"update": 3, "loss": 9.0},
-    ]
-    assert read_jsonl(folder.path / "cycles.jsonl")[0] == {"cycle": 0, "gains": [0.0, -0.0]}
-
-
 @pytest.mark.parametrize("number", [errno.EINVAL, errno.EACCES])
 def test_a_file_system_that_cannot_sync_folders_is_warned_of_once(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -32,6 +32,8 @@ def test_numbers_are_finite_and_of_numbers_alone(value) -> None:
     if found is not None:
         assert found.shape == (len(value),) and np.isfinite(found).all()
         assert number(value) == pytest.approx(found.mean())
+    told = records.flat({"a": value, "shares": {"b": value}})
+    assert all(math.isfinite(each) for each in told.values())
     one = number(value)
     assert math.isnan(one) or abs(one) < records.LARGEST
 

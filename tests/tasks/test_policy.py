@@ -20,8 +20,6 @@ from torchrl.envs import (
     Compose,
     GymEnv,
     InitTracker,
-    ObservationNorm,
-    RewardClipping,
     TransformedEnv,
 )
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -178,14 +176,6 @@ def test_drawn_actions_have_the_policys_probabilities(tmp_path: Path) -> None:
     policy.save(tmp_path / "policy.pt2", deterministic=False)
     drawn = torch.export.load(tmp_path / "policy.pt2").module()(torch.as_tensor(seen)).numpy()
     assert abs((drawn == 2).mean() - expected) < 4 * (0.25 / len(drawn)) ** 0.5
-
-
-def test_transforms_of_what_is_seen_are_refused_and_those_of_rewards_are_not() -> None:
-    halved = ObservationNorm(0.0, 0.5, in_keys=["observation"])
-    tasks = [walk_task(transforms=[one]) for one in (RewardClipping(-1, 1), halved)]
-    policy_of(tasks[0], tasks[0].learner([Streams(0)]))
-    with pytest.raises(ValueError, match="transforms: "):
-        policy_of(tasks[1], tasks[1].learner([Streams(0)]))
 
 
 @pytest.mark.parametrize("memory", [None, 8])

@@ -293,50 +293,6 @@ def test_what_was_predicted_is_that_of_the_proposal_also_after_a_resume() -> Non
     assert sampler.metrics()["predicted"] == pytest.approx((1 + 3) / (2 + 4))
 
 
-def test_mixed_groups_are_drawn_until_there_are_enough() -> None:
-    """All that was generated is counted, and told once; what is kept is what was mixed."""
-    teacher = prl.Teacher("domain_randomization", prl.Items(50), block=4)
-    calls: list[tuple[list[int], torch.Tensor]] = []
-
-    def generate(items: list[int]) -> torch.Tensor:
-        success = torch.tensor([[1, item % 3 > 0, 1, 0 if item % 3 == 1 else 1] for item in items])
-        calls.append((items, success.float()))
-        return success if len(calls) % 2 else success.tolist()  # type: ignore[return-value]
-
-    found = prl.mixed_groups(teacher, 6, generate)
-    every = [item for items, _ in calls for item in items]
-    rows = torch.cat([success for _, success in calls])
-    mixed = [place for place, item in enumerate(every) if item % 3 < 2]
-    assert found.places.tolist() == mixed
-    assert len(mixed) == 6
-    assert found.items == [every[place] for place in mixed]
-    assert torch.equal(found.success, rows[mixed].double())
-    assert found.rollouts == 4 * len(every)
-    log = teacher.log()
-    assert (log["told"], log["out"]) == (len(every), 0)
-    assert log["mean_success"] == pytest.approx(rows.mean().item())
-    few = prl.mixed_groups(teacher, 2, lambda items: torch.ones(len(items), 3), most=4)
-    assert (few.items, few.rollouts, tuple(few.success.shape)) == ([], 24, (0, 3))
-
-
-GROUP_SIZES = iter((2, 3))
-
-
-@pytest.mark.parametrize(
-    ("generate", "line"),
-    [
-        (lambda items: torch.ones(3), r"generate: has shape \[3\], but must have \[3, n\]"),
-        (lambda items: [torch.ones(next(GROUP_SIZES))] * 3, r"generate: .* must have \[3, 2\]"),
-    ],
-)
-def test_what_is_no_result_of_groups_of_one_size_drops_them(generate: Any, line: str) -> None:
-    teacher = prl.Teacher("domain_randomization", prl.Items(5), block=3)
-    with pytest.raises(ArgumentError, match=line):
-        prl.mixed_groups(teacher, 3, generate)
-    log = teacher.log()
-    assert (log["dropped"] + log["told"], log["out"]) == (log["proposed"], 0)
-
-
 def test_a_loader_that_draws_ahead_goes_on_bit_by_bit_or_at_least_validly() -> None:
     """By the states of now, rewound; and by that of the sampler when a batch was drawn."""
 

@@ -171,12 +171,12 @@ GROUND = ["flat", "stairs", "gap"]
 EYE = prl.Items(100, features=torch.eye(100))
 ORDERS = [prl.Parameters({"ground": order}) for order in (GROUND, GROUND[::-1])]
 OTHERS: dict[str, tuple[Any, Any, str]] = {
-    "renamed": (ranges(), prl.Parameters({"angle": (0.0, 8.0)}), "ranges.slope was 0 to 8, is mis"),
-    "a bit smaller": (ranges(), prl.Parameters({"slope": (0.0, 7.9999999)}), "is 0 to 7.9999999"),
+    "renamed": (ranges(), prl.Parameters({"angle": (0.0, 8.0)}), "ranges.slope was .*, is missing"),
+    "a bit smaller": (ranges(), prl.Parameters({"slope": (0.0, 7.9999999)}), "7.9999999"),
     "other features": (ITEMS, EYE, "feat"),
     "another target": (prl.Items(9, target=[1]), prl.Items(9, target=[2]), r"was \[1\], is \[2\]"),
-    "no target": (ranges(target={"slope": 8}), ranges(), "target.slope was .8.*, is missing"),
-    "another order": (*ORDERS, r"ranges.ground was \['flat', .*\], is \['gap', 'stairs', 'flat'\]"),
+    "no target": (ranges(target={"slope": 8}), ranges(), "target.slope was .*8.*, is missing"),
+    "another order": (*ORDERS, "ranges.ground was .*flat or stairs or gap.*, is .*gap or "),
     "seeds": (ranges(), ranges(seeded=True), "seeded was False, is True"),
     "a shape": (drawn(3), drawn(4), r"level was torch.float32 \[3\], is torch.float32 \[4\]"),
     "a task": (drawn(3), TASK, "kind was LevelGenerator, is "),
@@ -205,7 +205,7 @@ def test_a_state_of_another_space_is_refused_and_changes_nothing(what: str) -> N
 @pytest.mark.parametrize(
     ("before", "now", "message"),
     [
-        ("plr", "domain_randomization", "kind was plr, is domain_randomization; "),
+        ("plr", "domain_randomization", "kind was plr, is domain_randomization$"),
         ("model_transport", MODEL, "model.labels was above_w.*, is success"),
     ],
 )
@@ -462,24 +462,6 @@ def test_a_copy_in_another_process_is_refused() -> None:
     for copied in (pickle.dumps, copy.deepcopy):
         with pytest.raises(TypeError, match=r"send teacher\.client"):
             copied(teacher)
-
-
-NO_TARGET = prl.Parameters({"gravity": (0.0, 1.0)})
-UNFIT: list[tuple[Any, Any, dict[str, Any], str]] = [
-    ("sfl", SPACE, {}, r"sfl needs a student with exact_performance: it has no exact_perf"),
-    ("robust_plr", SPACE, {}, r"robust_plr needs a student with play: it has no play\(levels, gen"),
-    ("perf_gain", SPACE, {}, "curriculum: needs .* of a task"),
-    ("target", NO_TARGET, {}, "target: missing"),
-    ("plrr", SPACE, {}, "curriculum='plrr': must be .* accel, "),
-    ("target", SPACE, {"filter": "hard"}, "filter.hard"),
-    ("target", SPACE, {"filter": {"times": 1}}, "times=1"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "space", "more", "message"), UNFIT)
-def test_what_does_not_fit_is_named(name: Any, space: Any, more: Any, message: str) -> None:
-    with pytest.raises((ArgumentError, TypeError), match=message):
-        prl.Teacher(name, space, **more)
 
 
 def solved(levels: Any) -> dict[str, Any]:

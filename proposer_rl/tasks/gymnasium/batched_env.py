@@ -3,30 +3,22 @@
 from __future__ import annotations
 
 import multiprocessing
-import pickle
+import os
 import signal
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
 from functools import partial
-from multiprocessing.connection import Connection
-from threading import Lock
-from types import ModuleType
 from typing import Any, Literal
 
-import cloudpickle
 import gymnasium
 import numpy as np
 import torch
-from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
-from torch.utils._pytree import tree_map
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from proposer_rl.models import available_cores, check_torch_defaults
+from proposer_rl.models import check_torch_defaults
 from proposer_rl.tasks.gymnasium.environment import SuccessSettings, UnfitEnvironmentError
 from proposer_rl.tasks.gymnasium.player import (
     GymLevel,
@@ -41,10 +33,7 @@ Vectorization = Literal["sync", "async"]
 FLAGS = ("success", "is_init")  # entries that Solvers do not see
 # A fork of this process would inherit locks that its other threads hold, such as torch's, and wait
 # for them forever. The fork server has no threads, and imports torch once for all processes.
-_FORKSERVER = "forkserver" in multiprocessing.get_all_start_methods()  # not on Windows
-CONTEXT: Any = multiprocessing.get_context("forkserver" if _FORKSERVER else "spawn")
-GRACE = 10.0  # seconds that a process has to end
-_STARTING = Lock()
+START = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
 
 
 class GymnasiumEnv(EnvBase):
@@ -62,8 +51,8 @@ class GymnasiumEnv(EnvBase):
         parameters: what differs between levels, by name.
         success: when an episode is a success.
         reward_scale: factor of the rewards.
-        vectorization: ``"sync"`` steps one after another, ``"async"`` in as many processes as
-            there are cores.
+        vectorization: ``"sync"`` steps one after another, ``"async"`` each in a process of its
+            own.
         once: whether to play one episode of each level and then stand still, without reward.
     """
 
@@ -85,14 +74,18 @@ class GymnasiumEnv(EnvBase):
         self._plays = plays(levels, parameters)
         registered = gymnasium.registry.get(make.env_id)
         players = [
-            partial(_player, registered, make, parameters, play, success, once)
+            partial(_player, os.getpid(), registered, make, parameters, play, success, once)
             for play in self._plays
         ]
-        self._vector: SyncVectorEnv | ProcessVectorEnv
+        self._vector: SyncVectorEnv | AsyncVectorEnv
         if vectorization == "sync":
             self._vector = SyncVectorEnv(players, autoreset_mode=AutoresetMode.DISABLED)
         else:
-            self._vector = ProcessVectorEnv(players, available_cores())
+            if START == "forkserver":
+                multiprocessing.get_context(START).set_forkserver_preload([__name__])
+            self._vector = AsyncVectorEnv(
+                players, context=START, autoreset_mode=AutoresetMode.DISABLED
+            )
         acts = self._vector.single_action_space
         self._layout = Layout(self._vector.single_observation_space, acts)
         self._make_specs()
@@ -104,7 +97,7 @@ class GymnasiumEnv(EnvBase):
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Closes all environments, and ends their processes."""
-        self._vector.close()
+        self._vector.close(terminate=True)  # which SyncVectorEnv ignores
         super().close(raise_if_closed=raise_if_closed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
@@ -177,153 +170,17 @@ def plays(levels: TensorDictBase, parameters: Mapping[str, ParameterSettings]) -
     ]
 
 
-class LostProcessError(RuntimeError):
-    """A process that steps environments has ended; the message is one line."""
-
-    exit_code = 6
-
-
-class ProcessVectorEnv:
-    """Steps environments in several processes, as Gymnasium's vector environments do in one.
-
-    The number of processes does not change what an environment does.
-
-    Args:
-        makes: functions that make the environments.
-        count: processes, of which there are at most as many as environments.
-
-    Attributes:
-        num_envs: number n of environments.
-        single_observation_space, single_action_space: of each environment.
-        processes: that step them.
-    """
-
-    def __init__(self, makes: Sequence[Callable[[], Any]], count: int) -> None:
-        self.num_envs = len(makes)
-        self._parts = np.array_split(np.arange(len(makes)), min(count, len(makes)))
-        self._pipes: list[Connection] = []
-        self.processes = []
-        if _FORKSERVER:
-            CONTEXT.set_forkserver_preload([__name__])
-        for _ in self._parts:
-            ours, theirs = CONTEXT.Pipe()
-            process = CONTEXT.Process(target=_serve, args=(theirs,), daemon=True)
-            with _without_script():
-                process.start()
-            theirs.close()
-            self._pipes.append(ours)
-            self.processes.append(process)
-        # Cloudpickle also sends classes and functions of a script.
-        vectors = [
-            partial(SyncVectorEnv, [makes[i] for i in part], autoreset_mode=AutoresetMode.DISABLED)
-            for part in self._parts
-        ]
-        found = self._ask("make", [(cloudpickle.dumps(vector),) for vector in vectors])
-        self.single_observation_space: spaces.Space[Any] = found[0][0]
-        self.single_action_space: spaces.Space[Any] = found[0][1]
-
-    def reset(self, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begins episodes in all environments, or in those of the ``reset_mask``, bool [n]."""
-        parts = [(options and {"reset_mask": options["reset_mask"][part]},) for part in self._parts]
-        return _joined(self._ask("reset", parts)), {}
-
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Takes a step in each environment, with actions [n, ...]."""
-        shares = [tree_map(lambda rows, part=part: rows[part], actions) for part in self._parts]
-        answer: Any = _joined(self._ask("step", [(share,) for share in shares]))
-        return answer
-
-    def set_attr(self, name: str, values: Sequence[Any]) -> None:
-        """Sets an attribute of each environment to a value of its own."""
-        self._ask("set_attr", [(name, [values[i] for i in part]) for part in self._parts])
-
-    def close(self) -> None:
-        """Ends the processes, and kills those that do not end within ten seconds."""
-        for pipe in self._pipes:
-            pipe.close()
-        for process in self.processes:
-            process.join(GRACE)
-            if process.is_alive():
-                process.kill()
-                process.join(GRACE)
-
-    def _ask(self, what: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Calls a method in all processes at the same time, and returns their answers.
-
-        Raises:
-            Exception: of the first environment that fails.
-            LostProcessError: if a process has ended.
-        """
-        try:
-            for pipe, given in zip(self._pipes, arguments, strict=True):
-                pipe.send((what, given))
-            answers = [pipe.recv() for pipe in self._pipes]
-        except (EOFError, OSError) as error:
-            for process in self.processes:
-                process.join(1)
-            codes = [process.exitcode for process in self.processes if process.exitcode]
-            raise LostProcessError(
-                f"vectorization=async: a process of the environments was lost (exit code {codes}; "
-                "-9 mostly means that memory ran out)"
-            ) from error
-        for failed, answer in answers:
-            if failed:
-                raise answer
-        return [answer for _, answer in answers]
-
-
-def _joined(answers: list[Any]) -> Any:
-    """Returns the arrays in the answers of all processes, joined in their places."""
-    return tree_map(lambda *each: np.concatenate(each), *answers)
-
-
-def _player(registered: gymnasium.envs.registration.EnvSpec | None, *given: Any) -> LevelPlayer:
-    """Returns a player, also in a process in which the environment is not registered yet."""
+def _player(
+    home: int, registered: gymnasium.envs.registration.EnvSpec | None, *given: Any
+) -> LevelPlayer:
+    """Returns the environment that plays a level, in a process of its own or in the run's, home."""
+    if os.getpid() != home:
+        # These ask the run to stop, which saves its work first; this process ends with it.
+        for name in ("SIGINT", "SIGHUP", "SIGUSR1", "SIGUSR2"):
+            if hasattr(signal, name):  # Windows has the first alone
+                signal.signal(getattr(signal, name), signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        torch.set_num_threads(1)
     if registered is not None:
         gymnasium.registry.setdefault(registered.id, registered)
     return LevelPlayer(*given)
-
-
-@contextmanager
-def _without_script() -> Iterator[None]:
-    """Keeps new processes from running the script again, which may have no ``__main__`` guard."""
-    with _STARTING:
-        script = sys.modules["__main__"]
-        sys.modules["__main__"] = ModuleType("__main__")
-        try:
-            yield
-        finally:
-            sys.modules["__main__"] = script
-
-
-def _serve(pipe: Connection) -> None:
-    """Steps environments until the pipe is closed or the parent has ended."""
-    # These ask the parent to stop, which saves its work first; this process ends with the parent.
-    for name in ("SIGINT", "SIGHUP", "SIGUSR1", "SIGUSR2"):
-        if hasattr(signal, name):  # Windows has the first alone
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    torch.set_num_threads(1)  # there are as many processes as cores
-    env: Any = None
-    seen = None
-    with suppress(EOFError, OSError):  # of the pipe; those of environments are answers
-        while True:
-            what, given = pipe.recv()
-            try:
-                if what == "make":
-                    env = pickle.loads(given[0])()
-                    answer: Any = env.single_observation_space, env.single_action_space
-                elif what == "reset":
-                    # A vector environment takes no mask in which nothing is true.
-                    if given[0] is None or given[0]["reset_mask"].any():
-                        seen = env.reset(options=given[0])[0]
-                    answer = seen
-                elif what == "step":
-                    *answer, info = env.step(*given)
-                    answer.append({"success": info.get("success", np.zeros_like(answer[-1]))})
-                else:
-                    answer = getattr(env, what)(*given)
-                failed = False
-            except Exception as error:
-                failed, answer = True, error
-            pipe.send((failed, answer))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import pickle
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import cached_property
@@ -13,13 +12,11 @@ import gymnasium
 import numpy as np
 import torch
 from annotated_types import Ge, Gt, Le
-from gymnasium.vector.utils import CloudpickleWrapper
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl import envs
 from torchrl.data import TensorSpec
-from torchrl.envs import EnvBase, Transform
+from torchrl.envs import EnvBase
 
 from proposer_rl.extras import install_command, where_to_look
 from proposer_rl.learning import SolverSettings, in_first_episode
@@ -79,13 +76,11 @@ class GymnasiumTask(Task):
         reward_scale: factor of the rewards in training; returns are reported without it.
         network: the Solver's network.
         evaluation: how the Solver is measured.
-        vectorization: ``"sync"`` steps the environments one after another, ``"async"`` in as many
-            processes as there are cores.
+        vectorization: ``"sync"`` steps the environments one after another, ``"async"`` each in a
+            process of its own.
         extra: of this package, which the environment needs; None for none.
         solver: the Solver's training.
         context: device, precision and cores.
-        transforms: TorchRL's, of the batch of environments; those of the reward apply only in
-            training.
         train_seeds: count of seeds in training. ``target`` and ``all`` are then measured on other
             seeds, and ``train`` on those of the training. None for any seed in all of them.
 
@@ -112,7 +107,6 @@ class GymnasiumTask(Task):
         extra: str | None,
         solver: SolverSettings,
         context: ComputeContext,
-        transforms: list[Any] | None = None,
         train_seeds: Annotated[int, Ge(1), Le(LARGEST_SEED - 1)] | None = None,
     ) -> None:
         self._parameters = parameters
@@ -122,7 +116,6 @@ class GymnasiumTask(Task):
         self._network = network
         self._evaluation = evaluation
         self._vectorization = vectorization
-        self._transforms = list(_checked_transforms(transforms or []))
         self._envs: dict[torch.Size, EnvBase] = {}
         train = range(LARGEST_SEED) if train_seeds is None else range(train_seeds)
         space, target = spaces(parameters, seeds=train, device=context.device)
@@ -159,7 +152,8 @@ class GymnasiumTask(Task):
         small = all(spec.ndim == 1 for spec in self._seen.values())
         self.batched = True if small and network.memory is None else None
         self._measured = {
-            "environment": [env_id, arguments, list(wrappers), [repr(t) for t in transforms or []]],
+            # Older runs name TorchRL's transforms last, of which there are none.
+            "environment": [env_id, arguments, list(wrappers), []],
             "steps": self.max_steps,
             "parameters": {name: one.measured for name, one in parameters.items()},
             "success": asdict(success),
@@ -192,15 +186,13 @@ class GymnasiumTask(Task):
 
     def environment(self, levels: TensorDictBase) -> EnvBase:
         """Returns environments for training."""
-        return self._env(levels, self._transforms, vectorization=self._vectorization)
+        return self._env(levels, vectorization=self._vectorization)
 
     def evaluation_environment(self, levels: TensorDictBase) -> EnvBase:
         """Returns environments that play each level once, and are reused for a batch shape."""
         shape = levels.batch_size
         if shape not in self._envs:
-            self._envs[shape] = self._env(
-                levels, self._unpaid(), vectorization=self._vectorization, once=True
-            )
+            self._envs[shape] = self._env(levels, vectorization=self._vectorization, once=True)
         self._envs[shape].set_levels(levels)
         return self._envs[shape]
 
@@ -237,16 +229,7 @@ class GymnasiumTask(Task):
         return list(map(self._camera.picture, self._plays(levels), taken))
 
     def own_spaces(self) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any]]:
-        """Returns the spaces of observations and actions of one environment with its wrappers.
-
-        Raises:
-            ValueError: if transforms change what the Solver observes or does.
-        """
-        if self._unpaid():
-            raise ValueError(
-                "transforms: a plain environment does not apply these; use run.solver().actor() "
-                "in a TransformedEnv with them"
-            )
+        """Returns the spaces of observations and actions of one environment with its wrappers."""
         env = LevelPlayer(self._make, self._parameters, self._first)
         env.close()
         return env.observation_space, env.action_space
@@ -258,11 +241,8 @@ class GymnasiumTask(Task):
     def _plays(self, levels: TensorDictBase) -> list[GymLevel]:
         return plays(levels, self._parameters)
 
-    def _unpaid(self) -> list[Transform]:
-        return [one for one in self._transforms if "reward" not in one.out_keys]
-
-    def _env(self, levels: TensorDictBase, transforms: list[Transform], **how: Any) -> EnvBase:
-        env = GymnasiumEnv(
+    def _env(self, levels: TensorDictBase, **how: Any) -> GymnasiumEnv:
+        return GymnasiumEnv(
             levels,
             self._make,
             self._parameters,
@@ -270,62 +250,22 @@ class GymnasiumTask(Task):
             reward_scale=self.reward_scale,
             **how,
         )
-        return (
-            envs.TransformedEnv(env, envs.Compose(*map(_copied, transforms))) if transforms else env
-        )
 
     def _specs(self, level: TensorDictBase) -> tuple[dict[str, TensorSpec], TensorSpec]:
-        """Returns specs of observations and actions after the transforms, and tries the network.
+        """Returns specs of observations and actions, and tries the network.
 
         Raises:
-            ValueError: naming the key, if no network fits them.
+            ValueError: if no network fits them.
         """
-        key = "transforms" if self._transforms else "network"
         try:
-            env = self._env(level, self._transforms)
+            env = self._env(level)
             shown, acts = env.observation_spec[0], env.full_action_spec["action"][0]
             env.close()
             seen = {name: spec for name, spec in shown.items() if name not in FLAGS}
             SolverNetwork(list(seen.values()), acts, self._network)
         except (KeyError, RuntimeError, ValueError) as error:
-            raise ValueError(f"{key}: {cause(error)}") from error
+            raise ValueError(f"network: {cause(error)}") from error
         return seen, acts
-
-
-# These would silently train on something other than what is measured, or miss an episode's end.
-MISLEADING: dict[type[Transform], str] = {
-    **dict.fromkeys(
-        (envs.VecNorm, envs.VecNormV2),
-        "it keeps running statistics, other ones in evaluations; use PPO's "
-        "normalize_observations and normalize_rewards",
-    ),
-    envs.FrameSkipTransform: "it steps on beyond an episode's end; use one of wrappers",
-    envs.StepCounter: "the environment does not see its max_steps; use the task's",
-}
-
-
-def _checked_transforms(transforms: Iterable[Any]) -> Iterator[Transform]:
-    """Yields the transforms one by one, also those of a Compose.
-
-    Raises:
-        ValueError: if one is no transform, keeps running statistics, or misses an episode's end.
-    """
-    for one in transforms:
-        if isinstance(one, envs.Compose):
-            yield from _checked_transforms(part.clone() for part in one.transforms)
-            continue
-        why = next((why for kind, why in MISLEADING.items() if isinstance(one, kind)), "")
-        if not isinstance(one, Transform):
-            why = "must be a transform of TorchRL, as {_target_: torchrl.envs.RewardClipping}"
-        if why and getattr(one, "max_steps", True) is not None:  # a StepCounter may only count
-            raise ValueError(f"transforms: {type(one).__name__}: {why}")
-        yield one
-
-
-def _copied(transform: Transform) -> Transform:
-    """Returns a copy for another environment; deepcopy fails on buffers without a shape."""
-    copy: Transform = pickle.loads(pickle.dumps(CloudpickleWrapper(transform))).fn
-    return copy
 
 
 @contextmanager

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium import spaces
 from torchrl.envs.utils import check_env_specs
 
 from proposer_rl.runs.process import StopSignals
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.gymnasium import batched_env
-from proposer_rl.tasks.gymnasium.batched_env import GymnasiumEnv, LostProcessError
+from proposer_rl.tasks.gymnasium.batched_env import GymnasiumEnv
 from proposer_rl.tasks.gymnasium.environment import SuccessSettings
 from proposer_rl.tasks.gymnasium.player import GymLevel, LevelPlayer, MakeEnvironment
 from proposer_rl.tasks.parameters import ParameterSpace
-from tests.processes import ROOT
 from tests.tasks.gymnasium import toys
 from tests.tasks.gymnasium.odd import Line, odd
 from tests.tasks.gymnasium.toys import LIMIT, PARAMETERS, WALK, set_wind
@@ -89,47 +81,12 @@ def test_its_processes_end_when_a_run_does_and_leave_its_signals_alone() -> None
             assert process.exitcode == -signal.SIGTERM
 
 
-def test_a_process_that_is_lost_is_told() -> None:
-    env: Any = make(vectorization="async")
-    env.reset()
-    env._vector.processes[0].kill()
-    with pytest.raises(LostProcessError, match=r"async: a process .* was lost \(exit code \[-9\];"):
-        env.rollout(3)
-    env.close()
-
-
 def line(**members: Any) -> GymnasiumEnv:
     """One line of this kind in a process of its own."""
     levels = ParameterSpace({}).sample(1, Streams(0).generator())
     rule = SuccessSettings(kind="terminated")
     make = MakeEnvironment(odd(**members))
     return GymnasiumEnv(levels, make, {}, success=rule, vectorization="async")
-
-
-def slow_step(self: Any, action: Any) -> Any:
-    if self.t == 1:
-        time.sleep(600)
-    return Line.step(self, action)
-
-
-def test_a_process_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As after Ctrl-C while an environment works: nobody reads its answer."""
-    monkeypatch.setattr(batched_env, "GRACE", 0.1)
-    env: Any = line(step=slow_step)
-    env.rollout(1)
-    env._vector._pipes[0].send(("step", ([0],)))
-    env.close()
-    (process,) = env._vector.processes
-    process.join(60)
-    assert process.exitcode == -signal.SIGKILL
-
-
-def test_a_process_that_waits_for_its_answer_to_be_read_ends() -> None:
-    image = spaces.Box(0, 1, (1 << 20,), np.float32)
-    env: Any = line(observation_space=image, seen=lambda self: np.zeros(1 << 20, np.float32))
-    env._vector._pipes[0].send(("reset", (None,)))
-    env.close()
-    assert env._vector.processes[0].exitcode == 0
 
 
 def locked_step(self: Any, action: Any) -> Any:
@@ -143,37 +100,6 @@ def test_locks_that_are_held_while_its_processes_start_are_free_in_them() -> Non
         env = line(step=locked_step)
         assert env.rollout(3).shape == (1, 3)
     env.close()
-
-
-SCRIPT = """
-import gymnasium, numpy, proposer_rl.tasks.gymnasium.batched_env as batched, torch
-from proposer_rl.tasks.gymnasium.environment import SuccessSettings
-from proposer_rl.tasks.gymnasium.player import MakeEnvironment
-from proposer_rl.tasks.parameters import ParameterSpace
-SPACE = gymnasium.spaces.Box(-1, 1, (2,), numpy.float32)
-class Own(gymnasium.Env):
-    observation_space = action_space = SPACE
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return SPACE.low, {}
-    def step(self, action):
-        return SPACE.high, 1.0, False, False, {}
-gymnasium.register("Own-v0", Own, max_episode_steps=5)
-levels = ParameterSpace({}).sample(2, torch.Generator().manual_seed(0))
-rule = SuccessSettings(kind="survived")
-make = MakeEnvironment("Own-v0")
-env = batched.GymnasiumEnv(levels, make, {}, success=rule, vectorization="async")
-print(env.rollout(3)["next", "reward"].sum().item())
-"""
-
-
-def test_a_script_needs_no_main_guard_for_what_it_defines(tmp_path: Path) -> None:
-    (tmp_path / "script.py").write_text(SCRIPT)
-    ended = subprocess.run(
-        [sys.executable, "script.py"], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True, text=True, check=False, timeout=200,
-    )  # fmt: skip
-    assert (ended.stdout, ended.returncode) == ("6.0\n", 0), ended.stderr
 
 
 def test_its_specs_hold() -> None:

@@ -21,7 +21,7 @@ from proposer_rl.extras import install_command
 from proposer_rl.runs.folder import read_csv
 from proposer_rl.runs.records import TaskFacts, checked
 from proposer_rl.streams import Streams
-from proposer_rl.tasks.gymnasium import batched_env, pictures
+from proposer_rl.tasks.gymnasium import pictures
 from proposer_rl.tasks.gymnasium.player import (
     GymLevel,
     LevelPlayer,
@@ -117,8 +117,7 @@ def test_a_missing_extra_is_told_with_its_line(monkeypatch: pytest.MonkeyPatch) 
     assert line in str(caught.value) and "Box2D is not installed" in str(caught.value)
 
 
-def test_processes_change_no_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batched_env, "available_cores", lambda: 3)
+def test_processes_change_no_numbers() -> None:
     measured = []
     for vectorization in ("sync", "async"):
         task = walk_task(vectorization=vectorization)

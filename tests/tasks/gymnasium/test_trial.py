@@ -13,19 +13,6 @@ import torch
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from tensordict import TensorDict
-from torchrl.envs import (
-    CatFrames,
-    Compose,
-    FrameSkipTransform,
-    ObservationNorm,
-    RewardClipping,
-    RewardScaling,
-    RewardSum,
-    StepCounter,
-    UnaryTransform,
-    VecNorm,
-    VecNormV2,
-)
 
 from proposer_rl.streams import Streams
 from proposer_rl.tasks.gymnasium.environment import (
@@ -454,64 +441,3 @@ def test_memory_is_that_of_one_episode() -> None:
     values = rollout["state_value"].squeeze(-1)
     torch.testing.assert_close(values[..., 0], values[..., 3])
     assert not torch.allclose(values[..., 0], values[..., 1])
-
-
-def test_transforms_change_what_is_seen_and_leave_measured_returns_alone() -> None:
-    norm = ObservationNorm(loc=1.0, scale=2.0, in_keys=["observation"])
-    paid = RewardScaling(loc=0.0, scale=100.0)
-    plainly, changed = line_task(odd()), line_task(odd(), transforms=[norm, paid])
-    levels = plainly.target.sample(4, Streams(0).generator()).unsqueeze(0)
-    first, second = (task.environment(levels).reset()["observation"] for task in (plainly, changed))
-    torch.testing.assert_close(second, 2 * first + 1)
-    action = torch.ones(1, 4, dtype=torch.int64)
-    for evaluated, factor in ((False, 100.0), (True, 1.0)):
-        paid_out = []
-        for task in (plainly, changed):
-            env = task.evaluation_environment(levels) if evaluated else task.environment(levels)
-            state = env.reset()
-            for _ in range(3):
-                state = env.step(state.set("action", action))["next"]
-                paid_out.append(state["reward"])
-        torch.testing.assert_close(sum(paid_out[3:]), factor * sum(paid_out[:3]))
-
-
-@pytest.mark.parametrize(
-    "transforms",
-    [
-        [Compose(Compose(RewardClipping(-0.1, 0.1)), StepCounter())],
-        [RewardSum()],
-        [CatFrames(N=3, dim=-1, in_keys=["observation"], padding="constant")],
-        [UnaryTransform(["observation"], ["observation"], fn=lambda seen: 2 * seen)],
-    ],
-    ids=lambda transforms: type(transforms[0]).__name__,
-)
-def test_evaluations_show_what_training_shows_and_pay_what_the_environment_pays(
-    transforms: Any,
-) -> None:
-    paid = odd(step=lambda self, a: (Line.step(self, 0)[0], 0.5, False, False, {}))
-    task = line_task(paid, success=SuccessSettings(kind="survived"), transforms=transforms)
-    levels = task.target.sample(4, Streams(0).generator()).unsqueeze(0)
-    shown = [
-        env.rollout(3)["next"].select(*task._seen)
-        for env in (task.environment(levels), task.evaluation_environment(levels))
-    ]
-    assert (shown[0] == shown[1]).all()
-    learner = task.learner([Streams(0)])
-    learner.update([Streams(1).generator()])
-    assert task.measure(learner.agent)["target_return"] == 0.5 * LIMIT
-
-
-@pytest.mark.filterwarnings("ignore")  # TorchRL's: VecNorm is to become VecNormV2
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: "torchrl.envs.RewardScaling", "must be a transform of TorchRL"),
-        (lambda: Compose(VecNorm(in_keys=["observation"])), "VecNorm: it keeps running statistics"),
-        (lambda: VecNormV2(in_keys=["observation"]), "VecNormV2: it keeps running statistics"),
-        (lambda: FrameSkipTransform(2), "FrameSkipTransform: it steps on beyond an episode's end"),
-        (lambda: StepCounter(max_steps=4), "StepCounter: .* max_steps; use the task's"),
-    ],
-)
-def test_transforms_that_would_mislead_are_refused(make: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=f"transforms: .*{message}"):
-        line_task(odd(), transforms=[make()])

@@ -1,11 +1,10 @@
-"""The point mass as a task: its levels, pictures, runs, and what is refused."""
+"""The point mass as a task: its levels and runs."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -33,23 +32,6 @@ def test_the_target_is_where_it_is_said_to_be() -> None:
     (bin_,) = (task.target_shares > 0.5).nonzero().flatten().tolist()
     place = [part.item() for part in torch.unravel_index(torch.tensor(bin_), (8, 5, 2))]
     assert place == [6, 0, 0]
-
-
-def test_pictures_show_the_wall_and_the_way() -> None:
-    task: Any = point_masses()
-    learner = task.learner([Streams(0)])
-    levels = task.space.sample(4, Streams(0).generator()).unsqueeze(0)
-    learner.env.set_levels(levels)
-    rollout = learner.update([Streams(0).generator()]).rollout
-    still, moved = task.pictures(levels[0], None), task.pictures(levels[0], rollout[0])
-    for level, picture, way in zip(levels[0], still, moved, strict=True):
-        ends = [level["position"] - level["width"] / 2, level["position"] + level["width"] / 2]
-        dark = picture[60, :, 0] < 100
-        for column in range(120):
-            x = (column + 0.5) / 15 - 4
-            if min(abs(x - float(end)) for end in ends) > 0.2:
-                assert dark[column] == (not ends[0] < x < ends[1])
-        assert not np.array_equal(picture, way)
 
 
 @pytest.mark.usefixtures("own_folder")
