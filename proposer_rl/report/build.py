@@ -186,7 +186,6 @@ def _section(study: Study, prefix: str, files: dict[str, bytes]) -> page.Section
         "methods": methods,
         "tables": tables,
         "commands": page.commands(study),
-        "configs": page.configs(study),
     }
 
 
