@@ -43,33 +43,19 @@ METHODS = ", ".join(sorted(file.stem for file in (CONFIG_FOLDER / "method").glob
 
 # Changes to the settings of +method=target, and what the line must say; one of each kind.
 WRONG = [
-    ("seed=true", "seed=True: input should be a valid integer"),
     ("task.network.channels=[8,x]", "task.network.channels.1='x': input should be a valid integer"),
-    ("task.distributions.id=null", "task.distributions.id=None: input should be an object"),
     ("solver.batch_size=0", "solver.batch_size=0: input should be greater than or equal to 1"),
-    ("solver.ppo.learning_rate=nan", "learning_rate=nan: input should be a finite number"),
     ("schedule.threshold=1.5", "threshold=1.5: must be above 0 and at most 1, as id_success is"),
-    ("task.distributions.id.specifications=[[0.4]]", "specifications.0.1: missing"),
     ("task.network={channels:[1000000],groups:1}", "the run does not fit in memory: "),
-    ("precision=fp8", "precision='fp8': input should be 'auto', 'fp32' or 'bf16'"),
     ("compute.device=abacus", "compute.device=abacus: Expected one of cpu, cuda"),
-    ("proposer.action.kind=golden", "proposer.action"),
-    ("task.target=elsewhere", "task.target: must be among ['id', 'mix', 'ood'], got 'elsewhere'"),
     ("schedule.headline=fun", "headline='fun': must be one of ['id_success'"),
     # unknown keys
     ("solver.ppo.gama=1", "solver.ppo.gama: unknown; there are: adam_eps, anneal_"),
-    ("+sede=1", "sede: unknown; there are: method, scale"),
     ("+curriculum.x=1", "curriculum.x: unknown; there are: none"),
     ("seed=${nowhere}", "Interpolation key 'nowhere' not found full_key: seed"),
     ("task.target=???", "Missing mandatory value: task.target"),
     # contradictions
-    (
-        "solver.ppo.continue_episodes=true",
-        "solver.ppo.continue_episodes=True: this Solver reads its level once for a whole rollout",
-    ),
     ("solver.ppo.minibatches=129", "solver.ppo.minibatches=129: must be at most the 128"),
-    ("task.maze.max_steps=5", "task.maze.max_steps=5 must be at least 12, the path length of"),
-    ("task.space.path_lengths=[50]", "task.space: cannot make levels with obstacle_fraction=0"),
     # what a method is made of
     (
         "curriculum._target_=my_parts.make",
@@ -82,9 +68,8 @@ WRONG = [
 ]
 WRONG_COMMANDS = [
     (["+method=target", "task.network=[8]"], "override task.network=[8]: Cannot merge DictConfig"),
-    (["+method=target", "logger=paper"], "logger/paper: unknown; there are: csv,"),
+    (["--config-dir", "nowhere", "+method=target"], "nowhere' not found"),
     (["+method=target", "sede=1"], "sede: unknown; there are: ablation, checkpoint, compute,"),
-    (["+method=target", "seed"], "Error parsing override 'seed' missing EQUAL"),
     (["+method=target", "task.network=[1,2"], "error: task.network=[1,2: "),
     (["+method=target", "hydra.run.dir=runs/é"], "error: hydra.run.dir=runs/é: "),
     (["+method=target", "seeds=[1,1]"], "seeds=[1, 1]: must be distinct"),
@@ -95,22 +80,11 @@ WRONG_COMMANDS = [
         ["+method=paired", "proposer/action=problems", "proposer.action.ratio=joint"],
         "proposer.action.ratio=joint: here each draw is rewarded by itself",
     ),
-    (["+method=hand_designed", "hand_designed.until=[3, 2]"], "2 stages need 1 ascending positive"),
     (
         ["+method=hand_designed", "hand_designed.distributions=[x]"],
         "curriculum.distributions.x: unknown; there are: id, ood, mix",
     ),
     (["+method=target", "checkpoint=other"], "checkpoint=other: has no effect with method=target"),
-    (["+method=perf_gain", "curriculum.x=1"], "curriculum.x: unknown; there are: reward, check"),
-    (["+method=perf_gain", "curriculum.reward=0"], "curriculum.reward=0: input should be callable"),
-    (
-        ["+method=target", *SMOKE, "+filter=learnability", "filter.times=1"],
-        "filter.times=1: input should be greater than or equal to 2",
-    ),
-    (
-        ["+method=target", *SMOKE, "+filter=learnability", "filter.score=luck"],
-        "filter.score='luck': from source=exact there are",
-    ),
     (
         ["task=cartpole", "+method=target", "+filter=learnability"],
         "method=target needs a student with exact_performance: GymnasiumTask measures",

@@ -66,7 +66,7 @@ def played(level: TensorDictBase, actions: list[int]) -> tuple[float, bool]:
     total = 0.0
     for number, action in enumerate(actions, 1):
         _, reward, terminated, truncated, _ = player.step(action + 1)
-        total += TASK.reward_scale * reward
+        total += reward
         assert (terminated or truncated) == (number == len(actions))
     return total, terminated
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import doctest
 import functools
 import importlib.util
 import json
@@ -232,3 +233,19 @@ def test_every_method_scale_task_and_sweep_is_in_the_reference() -> None:
     for group in ("method", "scale", "task", "sweep", "as", "filter", "score"):
         files = {file.stem for file in (CONFIG_FOLDER / group).glob("*.yaml")}
         assert {name for name in files - names if not name.endswith("_accel")} == set(), group
+
+
+DOCTESTED = [
+    ".".join(file.relative_to(ROOT).with_suffix("").parts)
+    for file in sorted((ROOT / "proposer_rl").rglob("*.py"))
+    if ">>> " in file.read_text(encoding="utf-8")
+]
+
+
+@pytest.mark.parametrize("module", DOCTESTED)
+def test_the_examples_in_docstrings_are_true(
+    module: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = doctest.testmod(importlib.import_module(module))
+    assert result.attempted > 0
+    assert result.failed == 0, capsys.readouterr().out

@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDictBase
 
 from proposer_rl import curricula as c
 from proposer_rl.curricula import SamplingCurriculum, Scorer, TaskStudent, outcome_of
 from proposer_rl.experiment import Experiment, ScheduleSettings
-from proposer_rl.learning import PPO, PPOSettings, SolverSettings
+from proposer_rl.learning import PPO
 from proposer_rl.runs.checkpoint import CheckpointError, load_latest
 from proposer_rl.runs.folder import RunFolder, read_csv, read_jsonl
 from proposer_rl.runs.process import Interrupted, StopSignals
@@ -27,7 +26,6 @@ from proposer_rl.tasks.mazes.levels import shortest_path_length
 from proposer_rl.teaching import Teacher
 from tests.curricula.made import MADE
 from tests.same_run import StopAt, assert_same_run, tables
-from tests.tasks.gymnasium.toys import walk_task
 from tests.tiny import TASK, mountain_cars
 
 LENGTHS = {"updates": 5, "cycle_length": 2, "evaluate_every": 2, "checkpoint_every": 3}
@@ -159,26 +157,6 @@ def test_a_student_that_lacks_something_is_refused_before_anything_is_written(
     with pytest.raises(c.UnfitStudentError, match="Demanding needs a student with optimal_return"):
         experiment(tmp_path / "run", 0, curriculum=Demanding(cars.space), task=cars)
     assert not list((tmp_path / "run").iterdir())
-
-
-class Told(SamplingCurriculum):
-    """Keeps the returns that it is told."""
-
-    def observe(self, student: c.Student, batch: c.Batch, outcome: TensorDictBase) -> None:
-        self.returns = [*getattr(self, "returns", []), *outcome["return"].flatten().tolist()]
-
-
-@pytest.mark.parametrize("goes_on", [False, True])
-def test_outcomes_are_told_without_the_scale_of_the_rewards(goes_on: bool, tmp_path: Path) -> None:
-    found = []
-    for scale in (1.0, 0.01):
-        ppo = PPOSettings(horizon=16, epochs=1, continue_episodes=goes_on)
-        task = walk_task(solver=SolverSettings(batch_size=P, ppo=ppo), reward_scale=scale)
-        curriculum = Told(task.target)
-        folder = tmp_path / str(scale)
-        experiment(folder, 0, curriculum=curriculum, task=task, updates=1).run()
-        found.append(curriculum.returns)
-    assert found[1] == pytest.approx(found[0], rel=1e-5) and max(map(abs, found[0])) > 0.1
 
 
 @pytest.mark.parametrize("reads", ["outcomes", "plays of candidates", "plays before a filter"])

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -94,3 +96,35 @@ def test_a_refused_argument_imports_nothing_that_takes_seconds(tmp_path: Path) -
     for (*_, word), ending, line in zip(words, endings, refused, strict=True):
         assert ending.startswith("ended with 2 ") and ending.endswith(f"{word} set()")
         assert line.startswith("error: ") and word.partition("=")[0].lstrip("+") in line
+
+
+# What bash does at a press of Tab after LINE; the function is that of the command's last part.
+PRESS_TAB = r"""
+eval "$(bin/train -sc install=bash)"
+complete -p train
+COMP_LINE="$LINE" COMP_POINT=${#LINE} COMP_WORDS=($LINE) COMP_CWORD=$((${#COMP_WORDS[@]} - 1))
+hydra_bash_completion
+echo "${COMPREPLY[@]}"
+"""
+
+
+def test_bash_completes_the_name_of_a_method(tmp_path: Path) -> None:
+    command = tmp_path / "bin" / "train"  # starts Python as the repository's does
+    command.parent.mkdir()
+    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m proposer_rl.cli.start "$@"\n')
+    command.chmod(0o755)
+    process = subprocess.run(
+        ["bash", "-c", PRESS_TAB],
+        cwd=tmp_path,
+        env={
+            "PATH": "/usr/bin:/bin",
+            "PYTHONPATH": str(CONFIG_FOLDER.parent),
+            "LINE": "bin/train +method=perf",
+        },
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    registered, completed = process.stdout.splitlines()
+    assert registered.startswith("complete ") and registered.endswith(" train")
+    assert completed == "+method=perf_gain"

@@ -33,19 +33,27 @@ TRAINING = ("cli.run", "cli.build", "methods", "experiment.loop", "teaching")
 KNOW_MAZES = ("tasks.mazes", "tasks.view_mazes", "tasks.arena.planes", "api")
 
 
-def imported_names(tree: ast.AST, package: tuple[str, ...]) -> Iterator[str]:
+def imported_names(
+    tree: ast.AST, package: tuple[str, ...] = (), functions: bool = True
+) -> Iterator[str]:
     """Yield the dotted name of everything that a file imports, wherever in the file.
 
     ``from a import b`` yields ``a.b``: whether b is a module does not matter here. ``package`` is
-    the package that the file lies in, from which relative imports count.
+    the package that the file lies in, from which relative imports count. Without ``functions`` it
+    is what loading the file imports: neither what functions do nor what types are checked with.
     """
-    for node in ast.walk(tree):
+    for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else ()
             start = [*base, *([node.module] if node.module else [])]
             yield from (".".join([*start, alias.name]) for alias in node.names)
+        elif functions or not (
+            isinstance(node, ast.FunctionDef)
+            or (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
+        ):
+            yield from imported_names(node, package, functions)
 
 
 @cache

@@ -22,6 +22,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from tests.test_bin import MODULES
+from tests.test_layering import ROOT as PACKAGE
+from tests.test_layering import imported_names, modules
 from tests.test_readme import README, blocks
 
 ROOT = Path(__file__).parents[1]
@@ -110,22 +112,6 @@ EXTRAS = "alp-gmm", "box2d", "minigrid", "mujoco", "play", "ray", "tensorboard"
 OPTIONAL = {"play.server", "tasks.gymnasium.stumps", "teaching.sb3", "teaching.trl"}
 
 
-def imported(tree: ast.AST, functions: bool) -> set[str]:
-    """Modules that a file imports; without those of functions, what loading the file needs."""
-    found: set[str] = set()
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and not node.level:
-            found |= {str(node.module), *(f"{node.module}.{alias.name}" for alias in node.names)}
-        elif functions or not (
-            isinstance(node, ast.FunctionDef)
-            or (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
-        ):
-            found |= imported(node, functions)
-    return found
-
-
 def test_whatever_it_imports_is_required(built: Built) -> None:
     """Without an extra where files are loaded; with some extra in functions, too."""
     (project,) = metadata.distributions(path=[str(built.site)])
@@ -136,18 +122,15 @@ def test_whatever_it_imports_is_required(built: Built) -> None:
         found = {top for top in owners if required & {*map(canonicalize_name, owners[top])}}
         return {"proposer_rl", *sys.stdlib_module_names} | found
 
-    def tops(modules: set[str]) -> set[str]:
-        return {module.partition(".")[0] for module in modules}
-
     alone, extras = known(""), known("", *EXTRAS)
-    for file in (ROOT / "proposer_rl").rglob("*.py"):
-        tree = ast.parse(file.read_text(encoding="utf-8"))
-        assert tops(imported(tree, functions=True)) <= extras | BROUGHT, file
-        name = ".".join(file.relative_to(ROOT / "proposer_rl").with_suffix("").parts)
+    for name, tree in modules(PACKAGE).items():
+        every = {*imported_names(tree)}
+        assert {one.partition(".")[0] for one in every} <= extras | BROUGHT, name
         if name not in OPTIONAL:
-            loaded = imported(tree, functions=False)
-            assert tops(loaded) <= alone, file
-            assert not loaded & {f"proposer_rl.{other}" for other in OPTIONAL}, file
+            loaded = {*imported_names(tree, functions=False)}
+            assert {one.partition(".")[0] for one in loaded} <= alone, name
+            started = tuple(f"proposer_rl.{other}." for other in OPTIONAL)
+            assert not [one for one in loaded if f"{one}.".startswith(started)], name
 
 
 def test_a_wheel_holds_the_package_and_its_configuration(built: Built) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import socket
 import subprocess
 import sys
@@ -83,28 +82,6 @@ def own_addresses() -> set[str]:
     except socket.gaierror:
         return set()
     return {str(entry[4][0]) for entry in found if not str(entry[4][0]).startswith("127.")}
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["nowhere"], "nowhere: is not a run's folder: it has no config.json"),
-        (["fresh"], "fresh: holds no checkpoints; give a run's folder or a checkpoint"),
-        (["{run}", "--port", "65536"], "must be a whole number from 0 to 65,535, got '65536'"),
-    ],
-)
-def test_bad_input_is_told_in_one_line(
-    arguments: list[str],
-    message: str,
-    run: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("fresh").mkdir()
-    shutil.copy(run / "config.json", "fresh")
-    assert message in refusal(capsys, *(word.format(run=run) for word in arguments))
 
 
 def test_a_port_in_use_is_told(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

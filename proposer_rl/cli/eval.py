@@ -51,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
         "--levels",
         metavar="FILE|NAME",
         help="a distribution of the run such as id or ood; where the task has files of levels also "
-        "one that ends in .txt or .json, a run's curriculum.jsonl, or a set that comes along: "
+        "one that ends in .txt, a run's curriculum.jsonl, or a set that comes along: "
         "shapes, the default there, or small; where levels are grids, NAME@HxW is a distribution "
         "on another one",
     )

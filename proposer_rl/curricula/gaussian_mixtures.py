@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from importlib.util import find_spec
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Interval
@@ -44,9 +44,6 @@ class MixtureCurriculum(CountingCurriculum):
 
     Args:
         space: that has the bins.
-        source: of the return: ``"episodes"`` for the return in training; ``"exact"`` for the
-            student's performance at the time of the proposal, which costs an evaluation and is
-            exact if the task's performance is.
         warmup: number of episodes before the first mixture.
         refit: number of episodes between two mixtures, and to which one is fitted.
         components: largest number of Gaussians in a mixture; the smallest is two.
@@ -66,7 +63,6 @@ class MixtureCurriculum(CountingCurriculum):
         self,
         space: Space,
         *,
-        source: Literal["episodes", "exact"] = "episodes",
         warmup: TwoOrMore = 250,
         refit: TwoOrMore = 250,
         components: TwoOrMore = 10,
@@ -84,8 +80,7 @@ class MixtureCurriculum(CountingCurriculum):
                 f"warmup={warmup}: a mixture is fitted to that many episodes"
             )
         super().__init__(space)
-        self.needs = ("performance",) if source == "exact" else ()
-        self._source, self._components, self._refit = source, components, refit
+        self._components, self._refit = components, refit
         self._warmup, self._exploration = warmup, exploration
         # Points and tasks [H, D], returns and progress [H], float64 on the CPU.
         self._history: dict[str, Tensor] = {}
@@ -98,18 +93,13 @@ class MixtureCurriculum(CountingCurriculum):
         self._fit(rng)
         points = self._draw(count, rng.generator("choices"))
         levels, bins = self._points.levels(points, rng)
-        notes = {"bins": bins, "points": points}
-        if self._source == "exact":
-            reached = student.performance(levels, rng.generator("performance"))["return"]
-            notes["returns"] = reached.double().cpu()
-        return Batch(levels, TensorDict(notes, [count]))
+        return Batch(levels, TensorDict({"bins": bins, "points": points}, [count]))
 
     def observe(self, student: Student, batch: Batch, outcome: TensorDictBase) -> None:
         """Adds tasks, returns and progress to the history."""
         super().observe(student, batch, outcome)
         notes = batch.notes
-        returns = outcome["return"] if self._source == "episodes" else notes["returns"]
-        points, returns = notes["points"], returns.double().cpu()
+        points, returns = notes["points"], outcome["return"].double().cpu()
         tasks = self._points.tasks(points, notes["bins"])
         progress = torch.zeros_like(returns)
         if history := self._history:

@@ -13,7 +13,7 @@ from torch import Tensor
 from proposer_rl.curricula.batches import levels_in
 from proposer_rl.settings import ArgumentError
 from proposer_rl.streams import Streams
-from proposer_rl.task import Levels, Space, refuse_many_bins, refuse_unfit_bins
+from proposer_rl.task import Levels, Space, refuse_unfit_bins
 
 CHUNK = 2**16  # places to compare at once
 Place = Annotated[float, Interval(ge=-1, le=1)]
@@ -32,18 +32,11 @@ class Points:
         size: the number D of coordinates.
 
     Raises:
-        ValueError: if the space has a single bin or too many.
+        ArgumentError: if the space has a single bin or too many.
     """
 
     def __init__(self, space: Space, rounded: bool) -> None:
-        if rounded and space.axes and space.size < 2:
-            raise ArgumentError(
-                "rounded=true: the space has a single bin, to which all points would be rounded; "
-                "give its axes bins, or set rounded=false"
-            )
-        if not space.axes:
-            refuse_unfit_bins(space)
-        refuse_many_bins(space)
+        refuse_unfit_bins(space, 1 if space.axes and not rounded else 2)
         self._space, self._rounded = space, rounded
         places = space.coordinates.double()
         self.size: int = places.shape[1]

@@ -44,7 +44,7 @@ class ProblemProposer(CountingCurriculum):
         probe_levels: number C of probe levels.
 
     Raises:
-        ValueError: if the space has a single bin.
+        ArgumentError: if the space has a single bin.
     """
 
     needs: tuple[str, ...] = ("probe",)

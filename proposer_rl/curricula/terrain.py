@@ -17,7 +17,7 @@ from proposer_rl.curricula.points import refuse_crossed
 from proposer_rl.curricula.student import Student
 from proposer_rl.settings import ArgumentError, checked
 from proposer_rl.streams import Streams
-from proposer_rl.task import Space, refuse_many_bins
+from proposer_rl.task import Space, refuse_unfit_bins
 
 
 class RowsCurriculum(CountingCurriculum):
@@ -68,7 +68,7 @@ class RowsCurriculum(CountingCurriculum):
         self._rows = sizes[axis]
         if self._rows < 2:
             raise ArgumentError(f"row={name}: has a single row; give the axis bins")
-        refuse_many_bins(space)
+        refuse_unfit_bins(space)
         # The number of a bin is (before * rows + row) * after + rest.
         self._before, self._after = prod(sizes[:axis]), prod(sizes[axis + 1 :])
         super().__init__(space)

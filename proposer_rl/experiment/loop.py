@@ -6,7 +6,6 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from itertools import chain
 from typing import Annotated, Any
 
 import torch
@@ -232,8 +231,6 @@ class Experiment:
             own = list(zip(batches, update.rollout.unbind(0), strict=True))
             credits = [[(batch, outcome_of(rollout))] for batch, rollout in own]
             played = [(batch.levels, rollout) for batch, rollout in own]
-        for _, outcome in chain(*credits):
-            outcome["return"] = outcome["return"] / self.task.reward_scale  # as in performance
         self.sides.observe(credits)
         self.updates += 1
         last = self.updates == self.schedule.updates

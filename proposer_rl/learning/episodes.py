@@ -76,7 +76,6 @@ def mean_performance(
     max_steps: int,
     episodes: int = 1,
     greedy: bool = False,
-    reward_scale: float = 1.0,
     at_once: int | None = None,
     drop_finished: bool = False,
 ) -> TensorDict:
@@ -93,7 +92,6 @@ def mean_performance(
         max_steps: of an episode.
         episodes: number of episodes on each level.
         greedy: whether to take the most probable actions instead of drawing them.
-        reward_scale: of the environment's rewards, by which the returns are divided.
         at_once: number of episodes of each Solver that are played at once; None for all.
         drop_finished: whether to drop finished levels by making smaller environments; for
             environments that are cheap to make, and may be stepped beyond an episode's end.
@@ -123,7 +121,7 @@ def mean_performance(
         remake = (lambda place, some=some: make_env(some[:, place])) if drop_finished else None
         for place, after, counts in play_episodes(agent, env, max_steps, noise, remake):
             ended = after.get("success", after["terminated"]).squeeze(-1)
-            returns[:, place] += after["reward"].squeeze(-1) * counts / reward_scale
+            returns[:, place] += after["reward"].squeeze(-1) * counts
             success[:, place] += (ended & counts).float()
         parts.append(TensorDict({"return": returns, "success": success}, some.batch_size))
     shape = (episodes, count) if side == 1 else (count, episodes)

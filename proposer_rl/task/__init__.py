@@ -18,6 +18,5 @@ from proposer_rl.task.protocols import check_distributions as check_distribution
 from proposer_rl.task.protocols import for_copies as for_copies
 from proposer_rl.task.protocols import level_inputs as level_inputs
 from proposer_rl.task.protocols import nearest_bins as nearest_bins
-from proposer_rl.task.protocols import refuse_many_bins as refuse_many_bins
 from proposer_rl.task.protocols import refuse_unfit_bins as refuse_unfit_bins
 from proposer_rl.task.protocols import space_features as space_features

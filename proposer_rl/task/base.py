@@ -82,7 +82,6 @@ class Task(ABC):
         exact_performance: whether :meth:`performance` draws nothing at random.
         exact_metrics: whether :meth:`measure` draws nothing at random.
         default_levels: name of the levels for :meth:`level_results` if none is given.
-        reward_scale: factor of rewards in training; returns are reported without it.
         batched: as in :class:`~proposer_rl.models.Population`.
         episodes_at_once: of each Solver in evaluations; None for all.
         observed: entries that are passed to the network, in order.
@@ -106,7 +105,6 @@ class Task(ABC):
     text_key: str | None = None
     results: Sequence[str] = ("success", "return")
     exact_performance: bool = False
-    reward_scale: float = 1.0
     batched: bool | None = None
     episodes_at_once: int | None = None
     observed: Sequence[str] = ("observation",)
@@ -231,7 +229,6 @@ class Task(ABC):
             max_steps=self.max_steps,
             episodes=self.episodes,
             greedy=self.greedy,
-            reward_scale=self.reward_scale,
             at_once=self.episodes_at_once,
             drop_finished=self.drop_finished,
         )
@@ -330,7 +327,7 @@ class Task(ABC):
                 means[name] = levels[name].double().mean(-1)
         if "success" in self.results:
             means["train_success"] = first_episode_success(rollout).float().mean(-1)
-        means["train_return"] = first_episode_return(rollout).mean(-1) / self.reward_scale
+        means["train_return"] = first_episode_return(rollout).mean(-1)
         return TensorDict(means, levels.batch_size[:1])
 
     def record(self, levels: Levels, rollout: TensorDictBase | None) -> list[dict[str, Any]]:

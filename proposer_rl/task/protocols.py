@@ -307,27 +307,14 @@ def check_distributions(known: Mapping[str, Any], target: str, measured: Sequenc
             raise ValueError(f"{key}: must be among {sorted(known)}, got {unknown[0]!r}")
 
 
-def refuse_many_bins(space: Space) -> None:
-    """Checks that a space has few enough bins to count each.
+def refuse_unfit_bins(space: Space, least: int = 2) -> None:
+    """Checks that a space has enough bins to choose among, and few enough to count each.
 
     Raises:
-        ArgumentError: if it has more than ``MOST_COUNTED``.
+        ArgumentError: if it has fewer than ``least``, or more than ``MOST_COUNTED``.
     """
-    if space.size > MOST_COUNTED:
+    if not least <= space.size <= MOST_COUNTED:
         raise ArgumentError(
-            f"space: {space.size:,} bins: at most {MOST_COUNTED:,}, each of which is counted; give "
-            "its axes fewer, such as bins=1 with rounded=false where a curriculum has that"
-        )
-
-
-def refuse_unfit_bins(space: Space) -> None:
-    """Checks that a space has several bins, and few enough to count each.
-
-    Raises:
-        ValueError: if it has one bin, or too many for :func:`refuse_many_bins`.
-    """
-    refuse_many_bins(space)
-    if space.size < 2:
-        raise ValueError(
-            "the space has a single bin, so there is nothing to choose among; give its axes bins"
+            f"space: {space.size:,} bins: must be {least} to {MOST_COUNTED:,}; give its axes more "
+            "or fewer, or set bins=1 with rounded=false where a curriculum has that"
         )

@@ -14,7 +14,6 @@ from proposer_rl.tasks.parameters import ParameterSpace
 from proposer_rl.teaching.spaces import Items
 
 MOST_PARTS = 64  # parts of a data set in which items are counted
-MOST_BINS = 4096  # bins among which the nearest is searched, in spaces with coordinates only
 
 
 class Tally:
@@ -80,7 +79,7 @@ def _bins(space: Any) -> tuple[dict[str, list[str]], Callable[[Levels], dict[str
     """Returns the names of the bins along each axis, and a function that finds levels in them.
 
     The function returns for levels [n] the bin along each axis, int64 [n]. There is no axis if the
-    space has no bins.
+    space has neither parameters nor items.
     """
     if isinstance(space, ParameterSpace):
         return {name: part.texts for name, part in space.bins.items()}, lambda levels: {
@@ -94,13 +93,4 @@ def _bins(space: Any) -> tuple[dict[str, list[str]], Callable[[Levels], dict[str
         return {"item": texts}, lambda levels: {
             "item": (levels["item"].cpu() * parts // space.size).clamp(0, parts - 1)
         }
-    if not hasattr(type(space), "locate") or space.size > MOST_BINS:
-        return {}, lambda levels: {}
-    names = {name: [f"{value:g}" for value in values] for name, values in space.axes.items()}
-    sizes = [*map(len, names.values())]
-
-    def nearest(levels: Levels) -> dict[str, Tensor]:
-        distances = torch.cdist(space.locate(levels).cpu().double(), space.coordinates.double())
-        return dict(zip(names, torch.unravel_index(distances.argmin(-1), sizes), strict=True))
-
-    return names, nearest
+    return {}, lambda levels: {}  # of others curricula log histograms

@@ -115,9 +115,6 @@ MADE: dict[str, Make] = {
     "progress": lambda: c.LearningProgressCurriculum(SPACE, probes=2, every=2),
     "progress of episodes": lambda: c.LearningProgressCurriculum(SPACE, source="episodes", every=2),
     "alp_gmm": lambda: c.MixtureCurriculum(SPACE, warmup=8, refit=6, components=3),
-    "alp_gmm, exact": lambda: c.MixtureCurriculum(
-        SPACE, source="exact", warmup=8, refit=6, components=3
-    ),
     "adr": lambda: c.BoundsCurriculum(SPACE, boundary=0.9, episodes=3, lower=0.0, upper=0.1),
     "terrain_levels": lambda: c.RowsCurriculum(SPACE, measure="return", lower=0.0, upper=0.1),
     "spdl": lambda: c.SelfPacedCurriculum(

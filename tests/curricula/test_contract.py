@@ -31,7 +31,7 @@ every = pytest.mark.parametrize("make", EVERY.values(), ids=EVERY)
 SCORES = {
     *("easy", "regret", "plr of regret", "gradients"),
     *("policy gradients", "sfl from episodes", "filtered from episodes", "filtered perf_gain"),
-    *("filtered paired", "filtered schedule", "alp_gmm, exact", "synchronous"),
+    *("filtered paired", "filtered schedule", "synchronous"),
 }
 REMEMBER = [name for name in EVERY if name not in SCORES]
 

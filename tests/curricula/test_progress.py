@@ -238,11 +238,10 @@ def test_a_warm_up_is_even_and_its_draws_are_rounded() -> None:
     assert ((points - tasks).abs() <= 0.25).all() and len(tasks.unique()) == 5
 
 
-@pytest.mark.parametrize("source", ["episodes", "exact"])
-def test_a_mixture_moves_to_what_is_learnt_and_leaves_when_it_is(source: str) -> None:
+def test_a_mixture_moves_to_what_is_learnt_and_leaves_when_it_is() -> None:
     """Bins 0 and 1 are learnt from update 10 to 29; the others never change."""
     task = Scripted(torch.zeros(8), batch_size=32)
-    curriculum = small(task, source=source)
+    curriculum = small(task)
     shares = []
     for update in range(60):
         task.skills = torch.zeros(8)
@@ -318,21 +317,6 @@ def test_draws_beyond_the_box_are_clipped_and_told() -> None:
     assert sum(told["histogram"]) == 5000
     step(curriculum, task, 1)
     assert sum(curriculum.log()["histogram"]) == 5000
-
-
-def test_performance_is_that_before_the_update_and_counted() -> None:
-    task = Scripted(torch.rand(8), batch_size=16)
-    curriculum = small(task, source="exact")
-    batch = curriculum.propose(task, 16, Streams(0))
-    assert task.evaluations == 16
-    expected = task.skills[batch.levels]
-    task.skills = torch.rand(8)
-    curriculum.observe(task, batch, reached(torch.rand(16)))
-    curriculum.log()
-    history = curriculum.state_dict()["history"]
-    torch.testing.assert_close(history["returns"], expected.double())
-    small(task).propose(task, 16, Streams(0))
-    assert task.evaluations == 16
 
 
 def test_without_scikit_learn_a_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:

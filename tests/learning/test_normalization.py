@@ -32,9 +32,7 @@ SETTINGS = PPOSettings(
 
 
 def made(**changed: Any) -> tuple[Any, PPO]:
-    task = walk_task(
-        solver=SolverSettings(batch_size=P, ppo=replace(SETTINGS, **changed)), reward_scale=1.0
-    )
+    task = walk_task(solver=SolverSettings(batch_size=P, ppo=replace(SETTINGS, **changed)))
     learner = task.learner([Streams(seed) for seed in range(K)])
     learner.env.set_levels(torch.stack([task.evaluated_on["target"][:P]] * K))
     return task, learner

@@ -190,13 +190,6 @@ def test_sets_files_and_what_was_trained_on(page: Page) -> None:
             )
 
 
-def test_what_is_saved_is_read_by_the_library(page: Page, tmp_path: Path) -> None:
-    told = asked(page, "file", {"name": "by hand", "rows": ROWS})
-    (tmp_path / "drawn.txt").write_text(told["text"])
-    ((name, level),) = read_levels(tmp_path / "drawn.txt").items()
-    assert name == "by hand" and level.to_text().splitlines() == ROWS
-
-
 def test_cars_are_looked_at_though_they_cannot_be_drawn(car_page: Page) -> None:
     told = CLIENT.get(f"{car_page.address}api/run").json()
     assert told["board"] is None and told["task_levels"] == "cars"

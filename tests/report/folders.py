@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.runs.folder import RunFolder
 from research.benchmarks.results import Result, Row, Spread
 
@@ -130,6 +131,21 @@ def write_run(
     if finished:
         run.write_json("summary.json", {**identity, "updates": updates})
     return folder
+
+
+def write_ends(folder: Path, ends: Mapping[str, Sequence[float]], **options: Any) -> Study:
+    """A study of methods whose seeds go straight to these ends, in two evaluations."""
+    for method, values in ends.items():
+        for seed, end in enumerate(values):
+            curve = [0.0, end / 2, end]
+            write_run(folder / f"{method}{seed}", method, [seed], curve, **options)
+    return study_in(folder)
+
+
+def study_in(folder: Path) -> Study:
+    """The study of the runs in a folder."""
+    (study,), _ = read_studies(sorted(folder.iterdir()), None)
+    return study
 
 
 def write_rockets(folder: Path, method: str, seed: int, **options: Any) -> Path:

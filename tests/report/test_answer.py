@@ -16,20 +16,15 @@ from proposer_rl.report import page
 from proposer_rl.report.comparisons import UNDECIDED
 from proposer_rl.report.outcomes import answer, comparison_table, first_rows, meaning
 from proposer_rl.report.studies import Study, read_studies
-from tests.report.folders import write_run
+from tests.report.folders import study_in, write_ends, write_run
 
 NOISE = np.random.default_rng(1).normal(0, 1, (8, 6))
 
 
 def study_of(folder: Path, ends: Mapping[str, float], seeds: int = 6, noise: float = 0.01) -> Study:
     """Methods whose mean along training is about half of their end."""
-    for number, (method, end) in enumerate(ends.items()):
-        for seed in range(seeds):
-            reached = end + noise * NOISE[number, seed]
-            curve = [0.0, reached / 2, reached]
-            write_run(folder / f"{method}{seed}", method, [seed], curve)
-    (study,), _ = read_studies(sorted(folder.iterdir()), None)
-    return study
+    chances = noise * NOISE[:, :seeds]
+    return write_ends(folder, {m: end + chances[i] for i, (m, end) in enumerate(ends.items())})
 
 
 def told(folder: Path, ends: Mapping[str, float], seeds: int = 6) -> Sequence[str]:
@@ -114,7 +109,7 @@ def test_p_is_corrected_for_the_comparisons_that_were_planned(tmp_path: Path) ->
         for seed in range(6):
             end = 0.5 + 0.01 * seed + own[seed]
             write_run(tmp_path / f"{method}{seed}", method, [seed], [0.0, end, end])
-    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
+    study = study_in(tmp_path)
     means = {
         group.label: [np.trapezoid(run.metrics["id_success"]) / 2 for run in group.runs]
         for group in study.groups
@@ -163,8 +158,9 @@ def test_a_method_alone_is_compared_with_nothing(tmp_path: Path) -> None:
     first, second = told(tmp_path, {"ours": 0.9})
     assert first.startswith("ours is the only method here") and "Nothing is compared" in second
     write_run(tmp_path / "shorter", "plr", curve=[0.0, 0.1])
-    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
-    assert answer(study)[0].startswith("ours is the only method with runs of 20 updates")
+    assert answer(study_in(tmp_path))[0].startswith(
+        "ours is the only method with runs of 20 updates"
+    )
 
 
 def test_what_a_method_does_is_what_its_run_recorded(tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ import pytest
 
 from proposer_rl.report.comparisons import difference, outcomes
 from proposer_rl.report.statistics import Estimate, mean_of
-from proposer_rl.report.studies import Study, read_studies
+from proposer_rl.report.studies import Study
 from research.claims import beyond, majority, paper_claims, within
-from tests.report.folders import TASK, cycle, write_run
+from tests.report.folders import TASK, cycle, study_in, write_ends, write_run
 from tests.report.test_outcomes import FAST, SEEDS, SLOW, curve_of, study_of
 
 STALL = "The baseline that trains on the target alone stalls at first."
@@ -67,22 +67,18 @@ def test_what_no_method_does_soon_is_not_held_against_one(tmp_path: Path) -> Non
 def test_alike_is_shown_by_narrow_intervals_of_methods_that_learnt(tmp_path: Path) -> None:
     names = ("task_difficulty", "perf_gain", "target")  # the second is the best by a little
     for folder, factor, expected in (("a", 1.0, "supported"), ("b", 0.05, "undecided")):
-        for number, name in enumerate(names):
-            for seed in range(SEEDS):  # each method with small chances of its own
-                end = factor * (0.9 + 0.01 * ((seed + number) * (number + 1) % 5))
-                write_run(tmp_path / folder / f"{name}{seed}", name, [seed], [0.0, end / 2, end])
-        (study,), _ = read_studies(sorted((tmp_path / folder).iterdir()), None)
-        found = verdicts(study)
+        ends = {  # each method with small chances of its own
+            name: [factor * (0.9 + 0.01 * ((s + i) * (i + 1) % 5)) for s in range(SEEDS)]
+            for i, name in enumerate(names)
+        }
+        found = verdicts(write_ends(tmp_path / folder, ends))
         assert found[ALIKE] == expected and found[SLIGHTLY] == expected, folder
 
 
 def test_a_sure_but_small_difference_does_not_refute_alike(tmp_path: Path) -> None:
     ends = {"perf_gain": (0.86, 0.002), "target": (0.9, 0.003), "task_difficulty": (0.8, 0.2)}
-    for name, (end, spread) in ends.items():
-        for seed, place in enumerate([0, 1, -1, 0.5, -0.5, 0.2][:SEEDS]):
-            value = end + spread * place
-            write_run(tmp_path / f"{name}{seed}", name, [seed], [0.0, value / 2, value])
-    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
+    places = np.array([0, 1, -1, 0.5, -0.5, 0.2])
+    study = write_ends(tmp_path, {name: end + by * places for name, (end, by) in ends.items()})
     outcome = next(one for one in outcomes(study) if one.name.startswith("OOD"))
     pair = [group for label in ("target", "perf_gain") if (group := study.group(label))]
     assert difference(outcome, *pair).p < 1e-3 and within(difference(outcome, *pair), 0.1)
@@ -95,18 +91,15 @@ def test_a_method_that_is_slightly_worse_is_not_slightly_better(tmp_path: Path) 
         for seed in range(SEEDS):
             curve = [0.0, end / 2, end + 0.02 * rng.normal()]
             write_run(tmp_path / f"{name}{seed}", name, [seed], curve)
-    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
-    assert verdicts(study)[SLIGHTLY] == "undecided"
+    assert verdicts(study_in(tmp_path))[SLIGHTLY] == "undecided"
 
 
 def test_a_correction_for_many_methods_makes_no_difference_insignificant(tmp_path: Path) -> None:
     """What is significant by itself is so however many other methods a report has."""
-    for seed in range(SEEDS):
-        ends = {"perf_gain": 0.9 + 0.01 * (seed + 1), "task_difficulty": 0.9 + 0.001 * seed}
-        ends |= {f"other_{i}": 0.6 + 0.1 * ((seed * i) % 5) for i in range(12)}
-        for name, end in ends.items():
-            write_run(tmp_path / f"{name}-{seed}", name, [seed], [0.0, end / 2, end])
-    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
+    seeds = np.arange(SEEDS)
+    ends = {"perf_gain": 0.91 + 0.01 * seeds, "task_difficulty": 0.9 + 0.001 * seeds}
+    ends |= {f"other_{i}-": 0.6 + 0.1 * ((seeds * i) % 5) for i in range(12)}
+    study = write_ends(tmp_path, ends)
     verdict, text = dict(paper_claims(study))[SLIGHTLY]  # type: ignore[misc]
     assert verdict == "undecided" and "without correction" in text
 
@@ -114,11 +107,7 @@ def test_a_correction_for_many_methods_makes_no_difference_insignificant(tmp_pat
 def test_a_pair_without_any_spread_does_not_hide_the_others(tmp_path: Path) -> None:
     ends = {"perf_gain": [0.9] * SEEDS, "task_difficulty": [0.9] * SEEDS}
     ends["target"] = [0.3 + 0.01 * seed for seed in range(SEEDS)]
-    for name, values in ends.items():
-        for seed, end in enumerate(values):
-            write_run(tmp_path / f"{name}{seed}", name, [seed], [0.0, end / 2, end])
-    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
-    assert verdicts(study)[ALIKE] == "contradicted"
+    assert verdicts(write_ends(tmp_path, ends))[ALIKE] == "contradicted"
 
 
 def test_a_space_in_which_more_need_not_be_harder_has_no_such_finding(tmp_path: Path) -> None:
@@ -126,8 +115,7 @@ def test_a_space_in_which_more_need_not_be_harder_has_no_such_finding(tmp_path: 
     for seed in range(SEEDS):
         cycles = [cycle(i, [0.1, 0.1], [[8 - i, 1, 1], [1, 1, 1 + i]]) for i in range(8)]
         write_run(tmp_path / f"p{seed}", "perf_gain", [seed], cycles=cycles, task=task)
-    (study,), _ = read_studies(sorted(tmp_path.iterdir()), None)
-    assert HARDER not in verdicts(study)
+    assert HARDER not in verdicts(study_in(tmp_path))
 
 
 def test_badge_and_text_tell_the_same(tmp_path: Path) -> None:

@@ -181,14 +181,9 @@ def test_a_study_goes_on_where_it_was_and_refuses_another_setting(
         assert one["drawn"] == other["drawn"] and sum(one["drawn"]) == 4 * 4
         np.testing.assert_allclose(one["passed"], other["passed"], atol=2e-4)
     capsys.readouterr()
-    for text, said in (
-        ('{"rounds": 5}', "another setting: prompts"),
-        ('{"round": 5}', "round"),
-        ("5", "must be a JSON object"),
-    ):
-        with pytest.raises(SystemExit) as end:
-            prompts.main([*given[:5], text])
-        assert end.value.code == 2 and said in capsys.readouterr().err
+    with pytest.raises(SystemExit) as end:
+        prompts.main([*given[:5], '{"rounds": 5}'])
+    assert end.value.code == 2 and "another setting: prompts" in capsys.readouterr().err
 
 
 @needs_results

@@ -155,16 +155,8 @@ def test_runs_that_are_not_finished_are_left_out_and_named(
     assert not other.exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["{run}", "--levels", "small", "-o", "x.json"], "must end in .csv"),
-        (["{run}", "--levels", "nothing"], "must be one of: "),
-        (["{run}", "--levels", "id", "-o", "{table}"], "holds no scores of runs"),
-    ],
-)
-def test_bad_input_gets_one_line(arguments, message, run: Path, tmp_path: Path, scores_of) -> None:
+def test_another_table_is_not_written_over(run: Path, tmp_path: Path, scores_of) -> None:
     (table := tmp_path / "table.csv").write_text("run,seed\na,1\n")
-    code, said = scores_of(*(word.format(run=run, table=table) for word in arguments))
-    assert code == 2 and said.startswith("error: ") and message in said
-    assert len(said.splitlines()) == 1
+    code, said = scores_of(run, "--levels", "id", "-o", table)
+    assert code == 2 and "holds no scores of runs" in said
+    assert table.read_text() == "run,seed\na,1\n"

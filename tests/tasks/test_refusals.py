@@ -15,14 +15,10 @@ VIEWS = ["task=view_maze_smoke", "compute.progress=false"]
 SEEDS = ["task=gymnasium", f"task.env_id={WALK}", "task.success.kind=terminated", *TINY]
 REFUSED = [
     ([*CARS, "+method=regret"], "GymnasiumTask must define optimal_return(levels)"),
-    ([*CARS, "+method=pace"], "must define differentiable_performance(agent, levels)"),
     ([*CARS, "+method=plr", "compute.collector=multiprocess"],
      "this method trains no replicas in workers; leave compute.collector=single"),
-    ([*CARS, "+method=first_order_proposer"], "needs a student with target_direction"),
     ([*SEEDS, "+method=plr", "+filter=model"], "space: must have axes"),
-    ([*VIEWS, "+method=first_order_gain"], "ViewMazeTask must define differentiable_performance"),
     ([*VIEWS, "+method=regret"], "needs a student with exact_performance: ViewMazeTask"),
-    ([*VIEWS, "+method=sfl"], "needs a student with exact_performance: ViewMazeTask"),
     ([*VIEWS, "+method=target", "task.maze.height=4"], "ood: perfect mazes have odd"),
     ([*VIEWS, "+method=target", "task.space.walls=[24]"], "space: 5x5 cells have at most 23"),
 ]  # fmt: skip
@@ -44,10 +40,6 @@ MISREAD = [
     (("# Größe\n" + WHOLE).encode("latin-1"), "'utf-8' codec can't decode"),
     (WHOLE.replace("defaults: [gymnasium, _self_]", "").encode(),
      "task._target_: missing: the class or function that makes the task; a file of your own"),
-    (WHOLE.replace("values: [1.0, 2.0]", "low: 1, high: 2, bins: 257").encode(),
-     "task.parameters.width.bins=257: input should be less than or equal to 256"),
-    (WHOLE.replace("target: 2.0", "target: .nan").encode(),
-     "task.parameters.width.target=[nan]: values=[nan] must be finite"),
 ]  # fmt: skip
 
 pytestmark = pytest.mark.usefixtures("own_folder")

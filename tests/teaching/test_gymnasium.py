@@ -7,7 +7,6 @@ import runpy
 import warnings
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -91,17 +90,6 @@ def test_levels_may_be_options_of_a_reset() -> None:
     env = prl.TaughtEnv(Told(), teacher, "options")
     _, info = env.reset(options={"more": 1})
     assert env.unwrapped.options == {"more": 1, **info["level"]}
-
-
-def test_attributes_lie_in_parts_of_the_environment_and_in_arrays() -> None:
-    ranges = {"g": (-9.5, -9.4), "h": ["grass", "stairs"], "windy": [True], "mass": range(2, 5)}
-    sets = {"g": "model.opt.gravity.2", "h": "ground", "windy": "windy", "mass": "masses.torso"}
-    teacher = prl.Teacher("domain_randomization", prl.Parameters(ranges))
-    model = SimpleNamespace(opt=SimpleNamespace(gravity=np.array([0.0, 0.0, -9.81])))
-    env: Any = answering(model=model, ground="flat", windy=False, masses={"torso": 1.0})
-    level = prl.TaughtEnv(env, teacher, sets).reset()[1]["level"]
-    assert env.model.opt.gravity.tolist() == [0.0, 0.0, level["g"]]
-    assert (env.ground, env.windy, env.masses) == (level["h"], True, {"torso": level["mass"]})
 
 
 def test_the_length_of_cartpole_is_all_of_what_it_computes_from_it() -> None:

@@ -251,12 +251,12 @@ LOGGED = ["proposed", "told", "dropped", "out", "mean_return", "mean_success", "
 def test_a_log_counts_what_went_out_and_came_back(name: str, space: str, tmp_path: Path) -> None:
     """Against counts of the levels themselves."""
     teacher, file = prl.Teacher(name, SPACES[space](), block=8), tmp_path / "log.jsonl"
-    ids, asked = teacher.ask(11)
+    ids, _ = teacher.ask(11)
     ticket, _ = teacher.ask()
     teacher.tell(ticket, 3.0)
     teacher.tell(ids[:4], torch.arange(4.0), [1, 1, 0, 1])
     teacher.drop(ids[4:6])
-    levels = [asked, teacher.propose(5)]
+    teacher.propose(5)
     teacher.observe({"return": [1.0] * 5})
     log = teacher.log(file)
     assert [*log][-7:] == LOGGED
@@ -267,11 +267,8 @@ def test_a_log_counts_what_went_out_and_came_back(name: str, space: str, tmp_pat
     }
     assert all(sum(bins.values()) == 17 for bins in log["drawn"].values())
     if space == "ranges":
-        gravity = np.concatenate([np.asarray(some["gravity"]) for some in levels])
-        bins = np.array(list(log["drawn"]["gravity"].values()))
-        rest = bins - np.histogram(gravity, [5, 10, 15, 20, 25])[0]
-        assert next(iter(log["drawn"]["gravity"])) == "5 to 10" and sorted(rest) == [0, 0, 0, 1]
-        assert list(log["drawn"]["ground"]) == ["flat", "stairs"]
+        names = {name: next(iter(bins)) for name, bins in log["drawn"].items()}
+        assert names == {"gravity": "5 to 10", "walls": "0 to 14", "ground": "flat"}
     empty = teacher.log(file)
     assert (empty["proposed"], empty["mean_return"], empty["out"]) == (0, None, 5)
     written = [json.loads(line) for line in file.read_text().splitlines()]
@@ -381,8 +378,6 @@ REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
     "no success": (lambda t: t.tell(0, 1.0), "success: missing: this curriculum requires it; tell"),
     "no episodes": (lambda t: t.tell(0, 1.0, 1, episodes=0), "episodes=0.0: must be a whole"),
     "a state while tickets are out": (lambda t: t.load_state_dict(t.state_dict()), "state: level"),
-    "success above 1": (lambda t: t.tell(0, 1.0, 7), "success=7.0: must be from 0 to 1"),
-    "too few": (lambda t: t.tell([0, 1], [0.0], [1, 0]), r"return_: has shape \[1\], but"),
     "observed before it was proposed": (lambda t: t.observe(NONE), "ids: missing: nothing is out"),
     "two batches": (lambda t: [t.propose(4), t.propose(4), t.observe(NONE)], "ids: missing: 2"),
     "a rollout of one step": (
@@ -390,13 +385,11 @@ REFUSED: dict[str, tuple[Callable[[prl.Teacher], Any], str]] = {
         r"return_: has shape \[4, 3\], but must have \[4\]",
     ),
     "an integer": (lambda t: t.tell(0, 10**400, 1), "return_=1000.*: must be numbers of float32"),
-    "many episodes": (lambda t: t.tell(0, 0, 1, episodes=10**16), r"episodes=1e\+16: .* to 1e\+15"),
     "complex ones": (lambda t: t.tell([0], torch.tensor([1j]), 1), "return_=.*: must be numbers"),
     "a truth value as a ticket": (lambda t: t.tell(True, 0, 1), "ids=True: must be whole"),
     "a rollout's sum": (ended(3e38, 3e38), "return_=inf: must be finite"),
     "no return": (lambda t: t.tell(0, None, 1), "return_=nan: must be finite"),
     "a result that there is not": (lambda t: observe(t, **NONE, sucess=ZEROS), "outcome.sucess"),
-    "asked for less than none": (lambda t: t.ask(-1), "n=-1: must be a whole number"),
 }  # fmt: skip
 
 

@@ -42,7 +42,7 @@ class GymnasiumEnv(EnvBase):
     After an episode an environment begins its level again, from the same seed. Observations are
     those of a :class:`~proposer_rl.tasks.gymnasium.spaces.Layout`: ``observation``, and perhaps
     images. ``success``, bool [*B, 1], is whether a step ended a successful episode, and
-    ``is_init``, bool [*B, 1], whether a state begins an episode. ``reward`` is scaled.
+    ``is_init``, bool [*B, 1], whether a state begins an episode.
 
     Args:
         levels: of a :class:`~proposer_rl.tasks.parameters.ParameterSpace`, [*B]; states are on
@@ -50,7 +50,6 @@ class GymnasiumEnv(EnvBase):
         make: makes one environment.
         parameters: what differs between levels, by name.
         success: when an episode is a success.
-        reward_scale: factor of the rewards.
         vectorization: ``"sync"`` steps one after another, ``"async"`` each in a process of its
             own.
         once: whether to play one episode of each level and then stand still, without reward.
@@ -63,13 +62,11 @@ class GymnasiumEnv(EnvBase):
         parameters: Mapping[str, ParameterSettings],
         *,
         success: SuccessSettings,
-        reward_scale: float = 1.0,
         vectorization: Vectorization = "sync",
         once: bool = False,
     ) -> None:
         check_torch_defaults()
         super().__init__(device=levels.device or "cpu", batch_size=levels.batch_size)
-        self._reward_scale = reward_scale
         self._parameters = parameters
         self._plays = plays(levels, parameters)
         registered = gymnasium.registry.get(make.env_id)
@@ -116,7 +113,7 @@ class GymnasiumEnv(EnvBase):
             seen,
             success=info.get("success", none),
             is_init=none,
-            reward=rewards * self._reward_scale,
+            reward=rewards,
             terminated=terminated,
             truncated=truncated,
             done=terminated | truncated,

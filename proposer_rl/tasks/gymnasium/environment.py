@@ -135,39 +135,6 @@ def _numbers(environment: Any) -> list[str]:
     )
 
 
-def read_step(result: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-    """Returns a step's result with the reward as a float and the ends as truth values.
-
-    Raises:
-        UnfitEnvironmentError: if the reward is not a number.
-    """
-    seen, reward, terminated, truncated, info = result
-    return seen, as_number(reward, "the reward"), bool(terminated), bool(truncated), info
-
-
-def as_number(value: Any, what: str, flag: bool = False) -> float:
-    """Returns a number, or the only element of an array, as a float.
-
-    Args:
-        value: what an environment returns.
-        what: it is, for the error.
-        flag: whether it must be a truth value, 0 or 1.
-
-    Raises:
-        UnfitEnvironmentError: if it is something else.
-    """
-    if type(value) is float and not flag:
-        return value
-    try:
-        element = np.asarray(value).item()
-    except (TypeError, ValueError, RuntimeError):
-        element = None
-    if not isinstance(element, int | float) or (flag and element not in (0, 1)):
-        kind = "true or false" if flag else "a number"
-        raise UnfitEnvironmentError(f"{what} must be {kind}, not {shown(value)}")
-    return float(element)
-
-
 def entries(info: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
     """Yields an info's entries by name, with those of nested mappings, as ``metrics.won``."""
     for name, value in info.items():
@@ -233,8 +200,12 @@ class SuccessSettings:
         known = dict(entries(info))
         value = known.get(self.key or "")
         if value is not None:
-            what = f"success.key={self.key}: the entry of the info"
-            return bool(as_number(value, what, flag=True))
+            if np.size(value) != 1 or np.asarray(value).item() not in (0, 1):
+                raise UnfitEnvironmentError(
+                    f"success.key={self.key}: the entry of the info must be true or false, not "
+                    f"{shown(value)}"
+                )
+            return bool(np.asarray(value).item())
         if not self.optional and (terminated or truncated):
             raise UnfitEnvironmentError(
                 f"success.key={self.key}: the last info of an episode has no such entry; it has: "

@@ -11,6 +11,7 @@ from pkgutil import resolve_name
 from typing import Annotated, Any, Literal, NamedTuple
 
 import gymnasium
+import numpy as np
 from annotated_types import Len
 from gymnasium.wrappers import TimeLimit
 
@@ -19,7 +20,6 @@ from proposer_rl.tasks.gymnasium.environment import (
     SuccessSettings,
     UnfitEnvironmentError,
     mismatch,
-    read_step,
     write_attribute,
 )
 from proposer_rl.tasks.gymnasium.spaces import cast_to
@@ -191,14 +191,15 @@ class LevelPlayer(gymnasium.Wrapper[Any, Any, Any, Any]):
             return self._seen, 0.0, False, False, {}
         rule = self._success
         try:
-            answer = read_step(self.env.step(action))
-            seen, reward, terminated, truncated, info = answer
+            seen, paid, *ends, info = self.env.step(action)
+            reward = paid if type(paid) is float else float(np.asarray(paid).item())
+            terminated, truncated = map(bool, ends)
             self._seen = cast_to(self.observation_space, seen)
             self._return += reward
             over = terminated or truncated
             if rule is not None and (over or rule.once):
-                ends = terminated, truncated, self.in_time
-                self._succeeded |= rule(*ends, self._return, info)
+                said = terminated, truncated, self.in_time, self._return, info
+                self._succeeded |= rule(*said)
         except Exception as error:
             raise self._fault("step", error) from error
         told = {"success": True} if over and self._succeeded else {}

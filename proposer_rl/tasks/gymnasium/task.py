@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import gymnasium
 import numpy as np
 import torch
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
@@ -73,7 +73,6 @@ class GymnasiumTask(Task):
         max_steps: step limit of an episode; None for the environment's own.
         parameters: what differs between levels, by name.
         success: when an episode is a success.
-        reward_scale: factor of the rewards in training; returns are reported without it.
         network: the Solver's network.
         evaluation: how the Solver is measured.
         vectorization: ``"sync"`` steps the environments one after another, ``"async"`` each in a
@@ -100,7 +99,6 @@ class GymnasiumTask(Task):
         max_steps: Annotated[int, Ge(1)] | None,
         parameters: dict[str, ParameterSettings],
         success: SuccessSettings,
-        reward_scale: Annotated[float, Gt(0)],
         network: NetworkSettings,
         evaluation: EvaluationSettings,
         vectorization: Vectorization,
@@ -112,7 +110,6 @@ class GymnasiumTask(Task):
         self._parameters = parameters
         self._make = MakeEnvironment(env_id, arguments, max_steps, wrappers)
         self._success = success
-        self.reward_scale = reward_scale
         self._network = network
         self._evaluation = evaluation
         self._vectorization = vectorization
@@ -242,14 +239,7 @@ class GymnasiumTask(Task):
         return plays(levels, self._parameters)
 
     def _env(self, levels: TensorDictBase, **how: Any) -> GymnasiumEnv:
-        return GymnasiumEnv(
-            levels,
-            self._make,
-            self._parameters,
-            success=self._success,
-            reward_scale=self.reward_scale,
-            **how,
-        )
+        return GymnasiumEnv(levels, self._make, self._parameters, success=self._success, **how)
 
     def _specs(self, level: TensorDictBase) -> tuple[dict[str, TensorSpec], TensorSpec]:
         """Returns specs of observations and actions, and tries the network.

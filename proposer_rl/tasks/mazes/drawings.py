@@ -20,7 +20,7 @@ from proposer_rl.runs.records import SampleRecord, checked, png
 from proposer_rl.settings import within
 from proposer_rl.tasks.mazes.levels import FREE, Level, shortest_path_length
 
-SUFFIXES = (".txt", ".json", ".jsonl")  # the last is a run's record of its training
+SUFFIXES = (".txt", ".jsonl")  # the last is a run's record of its training
 SETS = {file.stem: file for file in sorted(Path(__file__).parent.glob("*.txt"))}
 """Files of the sets of levels that come with the package, by name."""
 
@@ -125,18 +125,11 @@ def _paint(
 
 @dataclass
 class Item:
-    """A level in JSON: its name, the rows of its drawing, and the moves of its shortest path."""
+    """A level's name, the rows of its drawing, and the moves of its shortest path."""
 
     name: str
     level: list[str]
     path_length: int | None = None
-
-
-@dataclass
-class Items:
-    """The content of a file in JSON."""
-
-    levels: list[Item]
 
 
 def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict[str, Level]:
@@ -149,8 +142,7 @@ def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict
     batch, such as ``update_00010_1``, or ``seed_0_update_00010_1`` if there are several seeds.
 
     Args:
-        path: A file whose name ends in ``.txt`` (see :func:`levels_from_text`), ``.json`` or
-            ``.jsonl``.
+        path: A file whose name ends in ``.txt`` (see :func:`levels_from_text`) or ``.jsonl``.
         kind: Class of the levels, whose ``from_text`` reads their drawings.
 
     Returns:
@@ -165,8 +157,6 @@ def read_levels(path: str | os.PathLike[str], kind: type[Level] = Level) -> dict
         content = path.read_bytes()
     try:
         text = content.decode("utf-8-sig")  # some editors begin a file with a mark
-        if path.suffix == ".json":
-            return _levels(checked(Items, text.encode(), "").levels, kind)
         if path.suffix == ".jsonl":
             return _levels(_recorded(text), kind)
         return levels_from_text(text, path.stem, kind)

@@ -99,14 +99,7 @@ class PerfectSettings:
     kind: Literal["perfect"] = "perfect"
 
 
-@settings
-class RoomsSettings:
-    """Four rooms with a door between neighbours."""
-
-    kind: Literal["four_rooms"] = "four_rooms"
-
-
-ViewDistributionSettings = Annotated[ScatteredSettings | PerfectSettings | RoomsSettings, BY_KIND]
+ViewDistributionSettings = Annotated[ScatteredSettings | PerfectSettings, BY_KIND]
 
 
 @settings
@@ -151,8 +144,6 @@ class ViewDistribution:
         settings = self._settings
         if isinstance(settings, PerfectSettings):
             return perfect_mazes(count, *self._grid, generator)
-        if isinstance(settings, RoomsSettings):
-            return four_rooms(count, *self._grid, generator)
 
         def scattered(number: int) -> ViewLevel:
             ends = (settings.fewest, settings.most + 1)
@@ -164,7 +155,7 @@ class ViewDistribution:
     def __str__(self) -> str:
         kind = self._settings
         if not isinstance(kind, ScatteredSettings):
-            return kind.kind.replace("_", " ")
+            return kind.kind
         solvable = ", solvable" if kind.solvable else ""
         return f"{kind.fewest} to {kind.most} walls anywhere{solvable}"
 
@@ -317,25 +308,6 @@ def perfect_mazes(number: int, height: int, width: int, draw: torch.Generator) -
         new[levels, there[:, 0], there[:, 1]] = False
         here = there
     return _placed(~free, draw)
-
-
-def four_rooms(number: int, height: int, width: int, draw: torch.Generator) -> ViewLevel:
-    """Draws four rooms around a cross of walls, each of whose arms has a random door.
-
-    Start, goal and direction are uniform; a side has at least 3 cells.
-    """
-    middle = (height // 2, width // 2)
-    walls = torch.zeros(number, height, width, dtype=torch.bool)
-    walls[:, middle[0]], walls[:, :, middle[1]] = True, True
-    levels = torch.arange(number)
-    for arm, first, last in (
-        (walls[:, middle[0]], 0, middle[1]),
-        (walls[:, middle[0]], middle[1] + 1, width),
-        (walls[:, :, middle[1]], 0, middle[0]),
-        (walls[:, :, middle[1]], middle[0] + 1, height),
-    ):
-        arm[levels, torch.randint(first, last, (number,), generator=draw)] = False
-    return _placed(walls, draw)
 
 
 def solvable(draw_levels: Callable[[int], ViewLevel], number: int) -> ViewLevel:

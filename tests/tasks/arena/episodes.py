@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -50,3 +51,35 @@ def episodes(env: BatchedEnv, act: Callable[[Any], Tensor]) -> Mapping[str, Tens
         state = state.exclude("reward")
     assert not going.any()
     return {"success": success, "return": total, "steps": length, "places": torch.stack(places, 1)}
+
+
+def follow_minigrid(
+    env: BatchedEnv, state: TensorDict, twins: Sequence[Any], choose: Callable[[list[bool]], Any]
+) -> set[int]:
+    """Play MiniGrid's own environments beside ours: views, rewards and ends must be the same.
+
+    Returns which of them have reached the goal; ``choose`` gives each an action, [B].
+    """
+
+    def same_view(state: TensorDict, index: int, seen: dict[str, Any]) -> bool:
+        view = state["observation"][index].reshape(7, 7, 3).transpose(0, 1)
+        return bool((view.int().numpy() == seen["image"]).all())
+
+    assert all(same_view(state, i, one.gen_obs()) for i, one in enumerate(twins))
+    over, reached = [False] * len(twins), set()
+    for _ in range(env.max_steps):
+        actions = choose(over)
+        after = env.step(state.set("action", torch.from_numpy(actions)))["next"]
+        for index, other in enumerate(twins):
+            if over[index]:
+                continue
+            seen, reward, ended, late, _ = other.step(int(actions[index]))
+            assert same_view(after, index, seen)
+            assert float(after["reward"][index]) == pytest.approx(reward)
+            assert [bool(after[end][index]) for end in ("success", "terminated")] == [ended] * 2
+            over[index] = ended or late
+            assert bool(after["done"][index]) == over[index]
+            reached |= {index} if ended else set()
+        state = after.exclude("reward")
+    assert all(over)
+    return reached

@@ -11,7 +11,7 @@ import torch
 from torchrl.envs import check_env_specs
 
 from proposer_rl.tasks.arena.crossing import CrossingEnv
-from tests.tasks.arena.episodes import levels
+from tests.tasks.arena.episodes import follow_minigrid, levels
 
 STEPS, SIZES, WALLS = 80, (5, 7, 9, 11), (1, 2, 3, 4, 5)
 LIKELY = [0.1, 0.1, 0.7, 0.025, 0.025, 0.025, 0.025]  # of each action
@@ -56,32 +56,13 @@ def test_steps_and_views_are_those_of_minigrid() -> None:
     state, draws = env.reset(), np.random.default_rng(0)
     maps = state["state"][:, :8].int().tolist()
     twins = [twin(size, begun) for (size, _), begun in zip(kinds, maps, strict=True)]
-    over, reached, views = [False] * len(kinds), set(), 0
-    for _ in range(STEPS):
+
+    def choose(_: object) -> np.ndarray:
         actions = draws.choice(7, len(kinds), p=LIKELY)
         actions[::2] = [turned(one, draws) for one in twins[::2]]
-        after = env.step(state.set("action", torch.from_numpy(actions)))["next"]
-        for index, other in enumerate(twins):
-            if over[index]:
-                continue
-            seen, reward, ended, late, _ = other.step(int(actions[index]))
-            view = after["observation"][index].reshape(7, 7, 3).transpose(0, 1).int().numpy()
-            assert (view == seen["image"]).all()
-            views += 1
-            assert float(after["reward"][index]) == pytest.approx(reward)
-            assert [bool(after[end][index]) for end in ("success", "terminated")] == [ended] * 2
-            over[index] = ended or late
-            assert bool(after["done"][index]) == over[index]
-            reached |= {kinds[index]} if ended else set()
-        state = after.exclude("reward")
-    assert all(over) and views > 2000 and len(reached) > 8
+        return actions
 
-
-def test_the_first_view_is_minigrids() -> None:
-    env = CrossingEnv(levels(1, size=11, walls=5), max_steps=STEPS)
-    state = env.reset()
-    seen = twin(11, state["state"][0, :8].int().tolist()).gen_obs()["image"]
-    assert (state["observation"][0].reshape(7, 7, 3).transpose(0, 1).int().numpy() == seen).all()
+    assert len({kinds[index] for index in follow_minigrid(env, state, twins, choose)}) > 8
 
 
 @pytest.mark.parametrize(("size", "walls"), [(5, 1), (5, 2), (5, 5), (7, 2), (7, 3), (7, 5)])

@@ -8,11 +8,10 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
 from proposer_rl.tasks.arena.doorkey import DoorkeyEnv
-from tests.tasks.arena.episodes import levels
+from tests.tasks.arena.episodes import follow_minigrid, levels
 
 STEPS, SIZES = 60, (5, 6, 7, 8)
 LIKELY = [0.15, 0.15, 0.4, 0.1, 0.05, 0.14, 0.01]  # of each action, so that much happens
@@ -35,11 +34,6 @@ def twin(size: int, state: list[float]) -> object:
     env.put_obj(world_object.Key("yellow"), key_x, key_y)
     env.agent_pos, env.agent_dir, env.carrying, env.step_count = (x, y), way, None, 0
     return env
-
-
-def view(state: TensorDict, index: int) -> np.ndarray:
-    """What is seen, by column and row as in MiniGrid."""
-    return state["observation"][index].reshape(7, 7, 3).transpose(0, 1).int().numpy()
 
 
 def guided(env: object) -> int:
@@ -68,24 +62,13 @@ def test_steps_and_views_are_those_of_minigrid() -> None:
     env = DoorkeyEnv(levels(len(sizes), size=torch.tensor(sizes)), max_steps=STEPS)
     state, draws = env.reset(), np.random.default_rng(0)
     twins = [twin(size, begun) for size, begun in zip(sizes, state["state"].tolist(), strict=True)]
-    assert all((view(state, i) == one.gen_obs()["image"]).all() for i, one in enumerate(twins))
-    over, reached = [False] * len(sizes), set()
-    for _ in range(STEPS):
+
+    def choose(over: list[bool]) -> np.ndarray:
         actions = draws.choice(7, len(sizes), p=LIKELY)
         actions[::2] = [0 if over[i] else guided(twins[i]) for i in range(0, len(sizes), 2)]
-        after = env.step(state.set("action", torch.from_numpy(actions)))["next"]
-        for index, other in enumerate(twins):
-            if over[index]:
-                continue
-            seen, reward, ended, late, _ = other.step(int(actions[index]))
-            assert (view(after, index) == seen["image"]).all()
-            assert float(after["reward"][index]) == pytest.approx(reward)
-            assert [bool(after[end][index]) for end in ("success", "terminated")] == [ended] * 2
-            over[index] = ended or late
-            assert bool(after["done"][index]) == over[index]
-            reached |= {index} if ended else set()
-        state = after.exclude("reward")
-    assert all(over) and reached >= set(range(0, len(sizes), 2))
+        return actions
+
+    assert follow_minigrid(env, state, twins, choose) >= set(range(0, len(sizes), 2))
 
 
 @pytest.mark.parametrize("size", SIZES)

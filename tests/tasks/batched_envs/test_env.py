@@ -10,7 +10,6 @@ from torchrl.envs import check_env_specs
 
 from proposer_rl.models import population
 from proposer_rl.tasks.batched_envs import BatchedEnv, finalized, uniform
-from tests.host_reads import NoHostReads
 from tests.tasks.batched_envs.toys import StillEnv, WindyEnv
 
 MASK, GAMMA = 2**64 - 1, 0x9E3779B97F4A7C15
@@ -172,14 +171,3 @@ def test_on_a_gpu_finished_episodes_begin_again_without_a_look(
     assert rollouts[0]["next", "terminated"].any() and rollouts[0]["next", "truncated"].any()
     played = rollouts[0]["observation"][..., 1]
     assert played[:, 7].tolist() == [0.0, 1.0, 2.0] and played[:, -1].tolist() == [2.0, 0.0, 1.0]
-
-
-def test_nothing_is_read_back() -> None:
-    env = WindyEnv(winds(0.0, 1.0))
-    state = env.reset().set("action", torch.ones(2, 1))
-    with NoHostReads():
-        env.set_levels(winds_on_hand := TensorDict(dict(env._level), [2]))
-        after = env._step(state)
-        env.maybe_reset(after.exclude("reward"))
-        env._reset()
-    assert winds_on_hand.batch_size == (2,)

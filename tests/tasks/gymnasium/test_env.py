@@ -48,7 +48,7 @@ def by_hand(level: Any, actions: list[int]) -> list[tuple[Any, float, bool, bool
 
 @pytest.mark.parametrize("vectorization", ["sync", "async"])
 def test_it_is_gymnasium_s_environments_side_by_side(vectorization: Any) -> None:
-    env = make(vectorization=vectorization, reward_scale=0.5)
+    env = make(vectorization=vectorization)
     rollout = env.rollout(T, break_when_any_done=False)
     env.close()
     assert rollout.batch_size == (K, P, T)
@@ -59,9 +59,7 @@ def test_it_is_gymnasium_s_environments_side_by_side(vectorization: Any) -> None
             rows = by_hand(LEVELS[k, p], ours["action"].tolist())
             states, rewards, terminated, truncated = zip(*rows, strict=True)
             np.testing.assert_allclose(ours["observation"], np.stack(states), rtol=1e-6)
-            np.testing.assert_allclose(
-                ours["next", "reward"].squeeze(-1), 0.5 * np.array(rewards), rtol=1e-6
-            )
+            np.testing.assert_allclose(ours["next", "reward"].squeeze(-1), rewards, rtol=1e-6)
             assert ours["next", "terminated"].squeeze(-1).tolist() == list(terminated)
             assert ours["next", "truncated"].squeeze(-1).tolist() == list(truncated)
             assert ours["next", "success"].squeeze(-1).tolist() == list(terminated)
@@ -163,8 +161,8 @@ RULES = [
 
 @pytest.mark.parametrize(("rule", "expected"), RULES)
 def test_a_success_is_of_one_episode(rule: SuccessSettings, expected: Any) -> None:
-    """Who has been far on the left may be back at the end; returns begin anew, unscaled."""
-    env = GymnasiumEnv(LEVELS, MakeEnvironment(WALK), PARAMETERS, success=rule, reward_scale=0.1)
+    """Who has been far on the left may be back at the end; returns begin anew."""
+    env = GymnasiumEnv(LEVELS, MakeEnvironment(WALK), PARAMETERS, success=rule)
     rollout = env.rollout(10 * LIMIT, break_when_any_done=False)
     found, last_alone = set(), set()
     for row in rollout.reshape(K * P, -1):
@@ -172,7 +170,7 @@ def test_a_success_is_of_one_episode(rule: SuccessSettings, expected: Any) -> No
         rewards: list[float] = []
         for step in row["next"]:
             far.append(bool(step["observation"][0] < -1))
-            rewards.append(10 * step["reward"].item())
+            rewards.append(step["reward"].item())
             over = bool(step["done"])
             assert step["success"].item() == (over and expected(far, rewards))
             if over:

@@ -142,7 +142,7 @@ def test_statistics_and_returns_are_those_of_the_environment() -> None:
     rollout = learner.collect([Streams(2).generator()])
     told = task.training_metrics(levels, rollout)
     first = [row.tolist().index(True) + 1 for row in rollout["next", "done"][0].squeeze(-1)]
-    rewards = rollout["next", "reward"][0].squeeze(-1) / 0.5
+    rewards = rollout["next", "reward"][0].squeeze(-1)
     returns = [float(row[:end].sum()) for row, end in zip(rewards, first, strict=True)]
     assert float(told["train_return"][0]) == pytest.approx(np.mean(returns), rel=1e-5)
     assert float(told["speed"][0]) == pytest.approx(float(levels["speed"].mean()))

@@ -109,7 +109,6 @@ def walk_task(**changed: Any) -> GymnasiumTask:
         "max_steps": None,
         "parameters": PARAMETERS,
         "success": SuccessSettings(kind="terminated"),
-        "reward_scale": 0.5,
         "network": NetworkSettings(hidden=[8]),
         "evaluation": EvaluationSettings(levels=8),
         "vectorization": "sync",

@@ -11,9 +11,6 @@ import pytest
 import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env, data_equivalence
-from stable_baselines3 import PPO
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.evaluation import evaluate_policy
 from torchrl.envs import EnvBase, GymEnv
 
 from proposer_rl.tasks.mazes import Level, MazeEnv
@@ -169,25 +166,3 @@ def test_bad_actions_are_refused(action: Any) -> None:
     env.reset(seed=0)
     with pytest.raises(AssertionError, match="invalid"):
         env.unwrapped.step(action)
-
-
-@pytest.mark.slow
-def test_stable_baselines_learns_on_it() -> None:
-    """PPO's success on levels that it did not train on: from about 0.35 to over 0.6."""
-    rules = {"obstacle_fraction": 0.25, "path_length": 2, "height": 4, "width": 4, "max_steps": 8}
-    envs = make_vec_env(ID, n_envs=8, seed=0, env_kwargs=rules)
-    fresh = make_vec_env(ID, n_envs=8, seed=1000, env_kwargs=rules)
-    agent = PPO(
-        "MultiInputPolicy", envs, n_steps=32, batch_size=128, n_epochs=8, learning_rate=2e-3,
-        ent_coef=0.01, policy_kwargs={"net_arch": [64, 64]}, seed=0, device="cpu",
-    )  # fmt: skip
-
-    def success() -> float:
-        played = evaluate_policy(
-            agent, fresh, n_eval_episodes=100, deterministic=False, return_episode_rewards=True
-        )
-        return float(np.mean(np.array(played[0]) > 0))
-
-    assert success() < 0.5
-    agent.learn(6_144)
-    assert success() > 0.6

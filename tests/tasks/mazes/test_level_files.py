@@ -83,8 +83,6 @@ def test_round_trips(levels: dict[str, Level]) -> None:
         ("bad.txt", "[a]\nS.G\n[a]\nS.G", "level 'a': the name occurs twice"),
         ("bad.txt", "[a]\nS.G\n..", "level 'a': a level is a rectangle"),
         ("bad.txt", "[a]\npath_length: 3\nS.G", "is 3, but the shortest path has 2 moves"),
-        ("bad.json", '{"levels": []}', "holds no levels"),
-        ("bad.json", '{"levels": [{"name": "a"}]}', "levels.0.level: Field required"),
         ("bad.jsonl", '{"seed": 0, "levels": []}\n', "0.updates: Field required"),
         ("bad.jsonl", '{"seed": 0, "updates": 1, "levels": [{"text": ["S x"]}]}\n', "rectangle"),
     ],
@@ -146,15 +144,12 @@ def test_the_levels_of_a_run_are_read_from_its_record(tmp_path: Path) -> None:
 
 
 def test_levels_with_directions(tmp_path: Path) -> None:
-    """Drawn, in JSON, in a run's record; where there is none, an agent looks to the right."""
+    """Drawn, in a run's record; where there is none, an agent looks to the right."""
     file, drawings = tmp_path / "mine.txt", ["v.#\n#.G", "..^\nG.#"]
     file.write_text("[one]\n>..\n..G\n\n[two]\npath_length: 1\n^G\n\n[three]\nSG\n")
     levels = read_levels(file, ViewLevel)
     assert [int(level.direction) for level in levels.values()] == [0, 3, 0]
     assert levels["one"].to_text() == ">..\n..G"
-    table = tmp_path / "mine.json"
-    table.write_text(json.dumps({"levels": [{"name": "a", "level": ["v.", ".G"]}]}))
-    assert read_levels(table, ViewLevel)["a"].to_text() == "v.\n.G"
     records = [{"text": r["text"]} for r in level_records(ViewLevel.from_text(drawings), None)]
     (tmp_path / "own.jsonl").write_text(
         json.dumps({"updates": 5, "seed": 0, "levels": records}) + "\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -10,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+from proposer_rl.streams import Streams
 from proposer_rl.tasks.point_masses import PointMassEnv
+from tests.tiny import point_masses
 
 DOWN, UP, RIGHT = (0.0, -1.0), (0.0, 1.0), (1.0, 0.0)
 
@@ -131,3 +134,14 @@ def test_success_is_to_be_at_the_goal_in_the_end() -> None:
     by = fly((0.0, 1.0, 0.0), DOWN, steps=100)
     assert not any(bool(state["success"]) for state in by)
     assert any(abs(float(state["observation"][2]) + 3) < 0.25 for state in by)
+
+
+def test_the_target_is_where_it_is_said_to_be() -> None:
+    task: Any = point_masses()
+    levels = task.target.sample(500, Streams(0).generator())
+    assert float(levels["position"].mean()) == pytest.approx(2.5, abs=1e-3)
+    assert float(levels["position"].std()) == pytest.approx(0.004, abs=1e-3)
+    assert set(levels["width"].tolist()) == {0.5} and set(levels["friction"].tolist()) == {0.0}
+    (bin_,) = (task.target_shares > 0.5).nonzero().flatten().tolist()
+    place = [part.item() for part in torch.unravel_index(torch.tensor(bin_), (8, 5, 2))]
+    assert place == [6, 0, 0]
