@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -59,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--settings",
         type=json.loads,
         default={},
-        help="of the curricula, such as '{\"delta\": 0.5}'",
+        help="of the curricula, such as '{\"delta\": 0.4}'",
     )
     parser.add_argument("--iterations", type=int, help="of training (those of the loop)")
     parser.add_argument("-o", "--output", type=Path, help="a JSON file for the rows")
@@ -71,6 +72,7 @@ def compare(options: argparse.Namespace) -> None:
     """Trains every method with every seed in every loop, and prints a table of each loop."""
     check_file("output", options.output, ".json")
     torch.set_num_threads(1)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it tells of every buffer
     stored = options.output is not None and options.output.exists()
     rows: list[dict[str, Any]] = json.loads(options.output.read_text()) if stored else []
     curves = {json.dumps({**row, "success": None}): row["success"] for row in rows}

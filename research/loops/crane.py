@@ -62,10 +62,9 @@ class CraneEnv(SimulatedEnv):
     def observe(self, state: Tensor) -> Tensor:
         """Returns the way of the trolley to the goal, the other numbers, and rope and gust."""
         place, speed, angle, turning, _ = state.unbind(-1)
-        apart, rope, gust = (self.level[name] for name in self.ranges)
-        return torch.stack(
-            [(apart - place) / 3, speed, 2 * angle, turning, angle.sin() * rope, rope / 2, gust], -1
-        )
+        distance, rope, gust = (self.level[name] for name in self.ranges)
+        trolley, load = [(distance - place) / 3, speed], [2 * angle, turning, angle.sin() * rope]
+        return torch.stack([*trolley, *load, rope / 2, gust], -1)
 
 
 COUNT, STEPS, BATCH = 8, 40, 128  # environments, steps of each in an iteration, and transitions
