@@ -116,11 +116,7 @@ def as_recipe(argument: str, group: Group, given: Any) -> Recipe:
         return given
     if not isinstance(given, str) or given not in available(group):
         raise _refusal(f"{argument}={given!r}: must be {HOW[group]} {', '.join(available(group))}")
-    return Recipe(group, given, _words(group, given))
-
-
-def _words(group: Group, name: str) -> tuple[str, ...]:
-    return (f"{group}={name}",)
+    return Recipe(group, given, (f"{group}={given}",))
 
 
 @cache
@@ -141,7 +137,7 @@ def recipe_function(
         raise AttributeError(f"there is no {name!r}; there are: {', '.join(available(group))}")
     from proposer_rl.settings import check_names, schema  # not needed for help
 
-    words = _words(group, name)
+    words = (f"{group}={name}",)
     known: dict[str, dict[str, Parameter]] = {}  # by top-level key
     if group == "task":
         known["task"] = _over({}, composed(words).task)

@@ -9,6 +9,7 @@ import sys
 
 import pytest
 
+from proposer_rl.cli import KEPT
 from tests.test_packaging import PROJECT
 
 ASK = """
@@ -56,13 +57,15 @@ GLIBC = sys.platform == "linux" and hasattr(ctypes.CDLL(None), "mallopt")
 
 @pytest.mark.skipif(not GLIBC, reason="needs glibc's malloc")
 def test_memory_that_was_used_is_kept_unless_the_user_says_otherwise() -> None:
-    def faults(**given: str) -> int:
+    def faults(module: str = "proposer_rl.cli.start", **given: str) -> int:
         kept = {k: v for k, v in os.environ.items() if not k.startswith(("MALLOC_", "GLIBC_"))}
-        command = [sys.executable, "-c", USE, "proposer_rl.cli.start"]
+        command = [sys.executable, "-c", USE, module]
         said = subprocess.run(command, env=kept | given, capture_output=True, text=True, check=True)
         return int(said.stdout)
 
-    # Where the kernel puts the heap right below another mapping it cannot grow, which is rare.
+    # Where the kernel puts the heap right below another mapping it cannot grow.
+    if faults("json", **{name: str(value) for name, (_, value) in KEPT.items()}) >= 1000:
+        pytest.skip("the C library keeps no memory here, even where it is told so directly")
     assert any(faults() < 1000 for _ in range(3))
     assert any(faults(MALLOC_ARENA_MAX="2") < 1000 for _ in range(3))
     assert faults(MALLOC_TRIM_THRESHOLD_="131072") > 5000

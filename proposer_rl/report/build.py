@@ -87,7 +87,7 @@ def write_report(
         parts.append(page.over_tasks(compared, f"{FIGURES}/"))
     for study in studies:
         prefix = f"{_slug(study.title)}_" if len(studies) > 1 else ""
-        if f"{TABLES}/{prefix}runs.csv" in files:  # same title, other measurements
+        if f"{TABLES}/{prefix}methods.csv" in files:  # same title, other measurements
             prefix += f"{len(sections) + 1}_"
         sections.append(_section(study, prefix, files))
         parts.append(page.section(study, f"{FIGURES}/{prefix}"))
@@ -159,9 +159,9 @@ def _add(tables: Sequence[Table], prefix: str, files: dict[str, bytes]) -> None:
 def _section(study: Study, prefix: str, files: dict[str, bytes]) -> page.Section:
     """Returns the page's section on a study, and adds its files to ``files``."""
     methods = outcomes.group_table(study)
-    tables = [outcomes.comparison_table(study), outcomes.run_table(study)]
+    pairs = outcomes.comparison_table(study)
     first, labels = page.first_of_study(study), [group.label for group in study.groups]
-    _add([first, methods, *tables], prefix, files)
+    _add([first, methods, pairs], prefix, files)
     named = [(group.label, run) for group in study.groups for run in group.runs]
     rows = runs.tables(named, "method")
     files |= {f"{TABLES}/{prefix}{name}.csv": runs.to_csv(own) for name, own in rows.items()}
@@ -184,9 +184,8 @@ def _section(study: Study, prefix: str, files: dict[str, bytes]) -> page.Section
         "data": page.pack(json.dumps(data, allow_nan=False, separators=(",", ":"))),
         "staged": data["stages"] is not None,
         "methods": methods,
-        "tables": tables,
+        "pairs": pairs,
         "commands": page.commands(study),
-        "configs": page.configs(study),
     }
 
 

@@ -1,4 +1,4 @@
-"""Tables of methods, pairs and runs, and the sentences that summarise them."""
+"""Tables of methods and pairs, and the sentences that summarise them."""
 
 from __future__ import annotations
 
@@ -244,34 +244,6 @@ def group_table(study: Study) -> Table:
         f"{INTERVALS}"
     )
     return Table("methods", "Methods", note, rows)
-
-
-def run_table(study: Study) -> Table:
-    """Returns a table with a row for each run."""
-    rows: list[dict[str, Cell]] = []
-    for group in study.groups:
-        for run in group.runs:
-            reached = run.reached(study.headline, study.threshold)
-            censored = math.isnan(reached)
-            rows.append(
-                {
-                    "method": group.label,
-                    "seed": str(run.seed),
-                    "folder": run.folder.name,
-                    "state": "finished" if run.finished else "unfinished",
-                    "updates": run.updates,
-                    f"updates to {level_text(study.headline, study.threshold)}": (
-                        None if censored else int(reached)
-                    ),
-                    "threshold": f"censored at {run.updates}" if censored else "reached",
-                    **{f"last {words(name)}": run.last(name) for name in study.measurements},
-                    "frames": int(run.last("frames")),
-                    "the curriculum's frames": int(run.last("curriculum_frames")),
-                    "evaluations": int(run.last("evaluations")),
-                    "seconds": float(run.own_seconds[-1]),
-                }
-            )
-    return Table("runs", "Runs", "Measurements are the last of each run.", rows)
 
 
 def answer(study: Study) -> list[str]:

@@ -6,7 +6,6 @@ import base64
 import gzip
 import hashlib
 import io
-import json
 import math
 import shlex
 from collections.abc import Iterable, Sequence
@@ -33,7 +32,7 @@ from proposer_rl.report.statistics import ERROR
 from proposer_rl.report.studies import Study
 from proposer_rl.report.style import DPI, Drawing, in_few_colours
 from proposer_rl.report.tables import Table, escape_markdown, write
-from proposer_rl.runs.records import anywhere, level_text, words
+from proposer_rl.runs.records import level_text, words
 
 PIXELS = 78  # of an inch of a figure
 WIDE = 140  # pixels of the dots of the first table
@@ -223,14 +222,6 @@ def commands(study: Study) -> list[str]:
             else:
                 found.append(f"{command}{_joined(own)}" if command.endswith("=") else command)
     return found
-
-
-def configs(study: Study) -> list[tuple[str, str]]:
-    """Returns the label and the settings, as JSON, of each group's first run."""
-    return [
-        (group.label, anywhere(json.dumps(group.runs[0].config, indent=1)))
-        for group in study.groups
-    ]
 
 
 def _digest(script: str) -> str:

@@ -25,7 +25,7 @@ X = "levels told"
 
 
 class Log:
-    """The lines of a log, as :meth:`Teacher.log` writes them."""
+    """The lines of a log, as :meth:`proposer_rl.teaching.teacher.Teacher.log` writes them."""
 
     def __init__(self, rows: Sequence[Record]) -> None:
         self.rows = rows
@@ -34,7 +34,10 @@ class Log:
 
     @cached_property
     def entries(self) -> dict[str, Column]:
-        """Numbers by name, NaN where there is none, float [m]; see :func:`flat`."""
+        """Numbers by name, NaN where there is none, float [m].
+
+        Of entries with several numbers these are the maximum and the mean.
+        """
         own = [flat({k: v for k, v in row.items() if k not in ASIDE}) for row in self.rows]
         known = dict.fromkeys(name for row in own for name in row)
         names = [*(name for name in COMMON if name in known), *known]

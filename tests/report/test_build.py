@@ -105,7 +105,7 @@ def test_there_are_figures_and_tables_for_other_tools(report: Path) -> None:
     for name in ("learning_curves", "proposals"):
         for suffix in ("svg", "png"):
             assert f"tiny_scale_2_4_mazes_{name}.{suffix}" in figures
-    for name in ("methods", "comparisons", "runs", "metrics", "training", "cycles", "levels"):
+    for name in ("methods", "comparisons", "metrics", "training", "cycles", "levels"):
         file = report.parent / "tables" / f"tiny_scale_2_4_mazes_{name}.csv"
         rows = list(csv.DictReader(file.open(encoding="utf-8")))
         assert rows and None not in rows[0]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from proposer_rl.report.outcomes import answer, group_table, run_table
+from proposer_rl.report.outcomes import answer, group_table
 from proposer_rl.report.statistics import Interval
 from proposer_rl.report.studies import Study, read_studies
 from proposer_rl.report.tables import Table, write
@@ -56,11 +56,6 @@ def test_the_group_table_has_the_numbers(tmp_path: Path) -> None:
     assert len(table.columns) == len(table.texts()[0]) == len(table.rows[0])
     assert rows["perf_gain"]["evaluations"] == 150
     assert rows["perf_gain"]["with the curriculum's (M)"] == pytest.approx(50 * 700 / 1e6)
-
-
-def test_censored_runs_are_said_to_be(tmp_path: Path) -> None:
-    text = run_table(study_of(tmp_path, target=SLOW)).to_markdown()
-    assert text.count("censored at 50") == SEEDS
 
 
 def test_a_baseline_that_is_not_finished_is_none(tmp_path: Path) -> None:
