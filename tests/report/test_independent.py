@@ -166,9 +166,6 @@ LARGE = (
 def test_of_the_committed_results(folder: Path) -> None:
     runs = pd.read_csv(folder / "runs.csv.xz", keep_default_na=False)
     variant = runs["ablation"].where(runs["ablation"] != "none", "").radd(", ").replace(", ", "")
-    # Besides ablations, published variants differ in this setting alone.
-    concentrates = runs["config"].str.contains('"concentrate": true')
-    variant += concentrates.map({True: ", curriculum.concentrate=True", False: ""})
     labels = dict(zip(runs["run"], runs["method"] + variant, strict=True))
     metrics = pd.read_csv(folder / "metrics.csv.xz")
     studies, notes = read_studies([folder], None)
