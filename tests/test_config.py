@@ -219,6 +219,7 @@ def test_a_value_may_refer_to_another(train) -> None:
     found = json.loads(Path("run/run.json").read_text())
     assert found["planned_updates"] == 1
     assert found["overrides"] == arguments
+    assert "method" in found["about"] and "ablation" not in found["about"]
 
 
 def test_without_ray_its_collector_is_refused(train, capsys, monkeypatch) -> None:

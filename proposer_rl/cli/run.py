@@ -240,9 +240,13 @@ def to_go_on(asked: Invocation) -> str:
 
 
 def _about(config: RunConfig, own: str | None) -> dict[str, str]:
-    """Returns the descriptions of the method and the ablation from their files."""
+    """Returns the descriptions of the method, and of its ablation if any, from their files."""
     folders = [CONFIG_FOLDER, *([Path(own)] if own else [])]
     chosen = {"method": config.method, "ablation": config.ablation}
-    said = {group: choices(group, folders).get(name, "") for group, name in chosen.items()}
+    said = {
+        group: choices(group, folders).get(name, "")
+        for group, name in chosen.items()
+        if name != "none"
+    }
     needed = needs(folders).get(config.method)
     return said if needed is None else {**said, "needs": ", ".join(needed)}
