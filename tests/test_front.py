@@ -299,6 +299,11 @@ def test_a_run_is_read_wherever_the_process_is_by_then(
     assert runs[1] == runs[3]
 
 
+def test_the_package_that_is_named_as_a_tasks_file_says_so() -> None:
+    with pytest.raises(TypeError, match=r"call prl.tasks.from_gymnasium\(env_id, ...\)$"):
+        prl.tasks.gymnasium(env_id="CartPole-v1")
+
+
 def test_a_hydra_around_a_run_is_left_as_it_was(tmp_path: Path) -> None:
     with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
         prl.train("maze", "target", updates=1, folder=tmp_path / "run", **SMOKE)
